@@ -43,7 +43,8 @@ def results(tmp_path_factory):
 def test_reproduce_writes_its_results(results):
     summary = json.loads((results / "summary.json").read_text())
     assert summary["limit_cycle"]["period"] == pytest.approx(1.0)
-    multipliers = np.array(summary["limit_cycle"]["multipliers"]) @ [1, 1j]
+    pairs = np.array(summary["limit_cycle"]["multipliers"])
+    multipliers = pairs @ [1, 1j]
     assert multipliers == pytest.approx(
         [
             -0.248983334735609 + 0.699333251798004j,

@@ -51,7 +51,8 @@ def test_the_lifted_system_is_the_periodic_one(model):
 
     for m in H.harmonics:
         back = wave(-(f + m))
-        found = np.einsum("fnyru,fn,fr->fyu", G, back, wave(f)) / N
+        turns = wave(f)
+        found = np.einsum("fnyru,fn,fr->fyu", G, back, turns) / N
         assert_allclose(found, H[m], rtol=0, atol=1e-12)
 
 
@@ -70,7 +71,8 @@ def test_python_control_gets_the_lifted_system(model):
     assert system.dt == 2.0
     assert system.input_labels[2] == "u[1]"
     f = np.linspace(0.01, 0.49, 7)
-    response = system(np.exp(2j * np.pi * f))
+    points = np.exp(2j * np.pi * f)
+    response = system(points)
     expected = convert.to_lti(model).htf(f).H[0]
     assert_allclose(np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12)
 
@@ -85,12 +87,14 @@ def test_python_control_gets_frequency_responses(model):
     omega = 2 * np.pi * f / 2.0
     assert_allclose(data.omega, omega)
     of_harmonic = data(1j * data.omega)
-    response = np.asarray(H[-1])[:, 0]
+    last_harmonic = np.asarray(H[-1])
+    response = last_harmonic[:, 0]
     assert_array_equal(of_harmonic[1], response.T)
 
     one = convert.to_control(H.select([0]))[0, 0]
     drawn = control.bode_plot(one).lines[0, 0][0]
-    modulus = np.abs(H[0][:, 0, 0])
+    H_0 = H[0][:, 0, 0]
+    modulus = np.abs(H_0)
     assert_allclose(drawn.get_ydata(), modulus)
 
 
@@ -159,7 +163,8 @@ def test_a_dataset_of_a_model_has_named_dimensions(model):
 def test_a_dataset_of_experiments_begins_at_section_0():
     pytest.importorskip("xarray")
     u = np.zeros((2, 4 * N, 2))
-    y = u + np.arange(4 * N)[:, None]
+    drift = np.arange(4 * N)[:, None]
+    y = u + drift
     data = hj.experiments.ExperimentData(u, y, n_sections=N, periods=2)
     dataset = convert.to_xarray(data)
     second_period = convert.from_xarray(dataset.isel(sample=slice(N, None)))

@@ -40,7 +40,8 @@ def names():
     data = hj.experiments.add_noise(clean, std=1e-5)
     est = hj.estimate_htf(data, harmonics=(-1, 0, 1))
     whole = hj.estimate_htf(data)
-    force = np.random.default_rng(0).normal(size=(1, 3000, 1))
+    rng = np.random.default_rng(0)
+    force = rng.normal(size=(1, 3000, 1))
     made = hj.testing.simulate_recording(cycle, 0.01 * force, OUTPUTS, rate=50)
     known = dict(
         hj=hj, np=np, hopper=hopper, cycle=cycle, apex=APEX, est=est, data=data
@@ -630,14 +631,16 @@ def test_p_values_are_those_of_the_coefficients(names):
     fit = names["fit"]
     other = names["ser"]
     true = names["cycle"].multipliers
-    missed = fit.coefficients - np.poly(true).real[1:]
+    exact = np.poly(true).real[1:]
+    missed = fit.coefficients - exact
     distance = missed @ np.linalg.solve(fit.covariance, missed)
     dof = fit.covariance_dof
     ratio = distance * (dof - 1) / (2 * dof)
     expected = stats.f.sf(ratio, 2, dof - 1)
     assert_allclose(fit.compare(true).p_value, expected, rtol=1e-6)
     missed = fit.coefficients - other.coefficients
-    distance = missed @ np.linalg.solve(fit.covariance + other.covariance, missed)
+    covariance = fit.covariance + other.covariance
+    distance = missed @ np.linalg.solve(covariance, missed)
     dof = min(dof, other.covariance_dof)
     ratio = distance * (dof - 1) / (2 * dof)
     expected = stats.f.sf(ratio, 2, dof - 1)
@@ -661,7 +664,8 @@ def test_a_fit_of_some_harmonics_says_so_where_it_is_validated(names):
     data = names["data"]
     some = hj.validate(names["fit"], data)
     assert [x.cause for x in some.findings] == ["harmonics"]
-    whole = hj.validate(hj.fit_multipliers(names["whole"], order=2), data)
+    fit = hj.fit_multipliers(names["whole"], order=2)
+    whole = hj.validate(fit, data)
     assert not whole.findings
     assert whole.independent
     # As the fit to the series explains the same data.
@@ -706,7 +710,8 @@ def test_a_system_from_functions_is_that_of_a_class():
         {"g": 9.81, "A": 0.15, "e": 0.7},
         period=1.0,
     )
-    cycle = hj.find_limit_cycle(juggler, hj.Guess("main", (0.2, 4.5), time=0.1))
+    guess = hj.Guess("main", (0.2, 4.5), time=0.1)
+    cycle = hj.find_limit_cycle(juggler, guess)
     *_, exact = hj.models.PaddleJuggler().exact()
     assert_allclose(cycle.multipliers, exact, atol=1e-12)
 

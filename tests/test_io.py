@@ -183,7 +183,8 @@ def rewrite(path, header=None, arrays=None):
     content.update(arrays or {})
     old["arrays"].update({name: "" for name in arrays or {}})
     merged = {**old, **(header or {})}
-    np.savez(path, header=np.array(json.dumps(merged)), **content)
+    header_text = json.dumps(merged)
+    np.savez(path, header=np.array(header_text), **content)
 
 
 @pytest.mark.parametrize(
@@ -213,7 +214,8 @@ def test_foreign_content(folder, things, change, says):
 def test_pickles_are_not_executed(folder, things):
     path = folder / "trap.npz"
     hj.save(path, things[2])
-    rewrite(path, arrays={"H": np.array([_Trap()], dtype=object)})
+    trap = np.array([_Trap()], dtype=object)
+    rewrite(path, arrays={"H": trap})
     with pytest.raises(hj.errors.FileFormatError, match="damaged"):
         hj.load(path)
     path.write_bytes(pickle.dumps(_Trap()))

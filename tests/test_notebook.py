@@ -32,7 +32,8 @@ def test_every_source_was_executed():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_executed_notebook_has_the_code_of_its_source(name):
-    notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text())
+    text = (NOTEBOOKS / f"{name}.ipynb").read_text()
+    notebook = json.loads(text)
     code = [
         "".join(c["source"]).strip()
         for c in notebook["cells"]
@@ -71,8 +72,10 @@ def own_system(found):
 def fit(found):
     assert found.fit.identifiability.rank == 5
     assert found.fit.contains(found.truth, 0.999)
-    error = np.abs(found.found.multipliers - found.real.multipliers).max()
-    before = np.abs(found.guess.multipliers - found.real.multipliers).max()
+    difference = found.found.multipliers - found.real.multipliers
+    error = np.abs(difference).max()
+    difference_before = found.guess.multipliers - found.real.multipliers
+    before = np.abs(difference_before).max()
     assert error < 2e-3 < before
 
 
@@ -119,7 +122,8 @@ def walking(found):
 def population(found):
     low = found.test["low"][0]
     high = found.test["high"][0]
-    difference = np.mean(found.true[6:]) - np.mean(found.true[:6])
+    second = np.mean(found.true[6:])
+    difference = second - np.mean(found.true[:6])
     assert low < difference < high < 0
 
 

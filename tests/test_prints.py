@@ -221,7 +221,8 @@ def test_fits_show_standard_errors():
     assert re.findall(r"± (\S+?)[,;]", repr(fit)) == errors  # one meaning in both
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1
-    htf = model.htf(np.linspace(0.05, 1.9, 30), harmonics=(0,))
+    f = np.linspace(0.05, 1.9, 30)
+    htf = model.htf(f, harmonics=(0,))
     assert "yM & co: multipliers" in "".join(shown(hj.identify.fit_rational(htf)).texts)
 
 

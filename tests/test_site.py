@@ -70,7 +70,8 @@ def test_users_call_or_construct_150_names_at_most():
 
 def test_every_public_name_that_a_user_writes_is_in_an_example():
     """Slow tests run the how-to pages and the README; notebooks run when they are built."""
-    pages = [ROOT / "README.md", *(ROOT / "docs/how-to").glob("*.md")]
+    guides = (ROOT / "docs/how-to").glob("*.md")
+    pages = [ROOT / "README.md", *guides]
     text = "".join(page.read_text() for page in pages)
     code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     files = (ROOT / "notebooks").glob("*.py")
@@ -119,7 +120,8 @@ def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
         return np.array(re.findall(r"-?\d+(?:\.\d+)?", text), float)
 
     for name in ("compass-gait", "slip", "van-der-pol"):
-        file = values((pictures.IMAGES / f"gallery/{name}.svg").read_text())
+        drawing = (pictures.IMAGES / f"gallery/{name}.svg").read_text()
+        file = values(drawing)
         assert_allclose(
             values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01
         )

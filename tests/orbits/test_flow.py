@@ -39,7 +39,8 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
     until = hj.flow(ball(), DROP, 1.0)
     left = 1.0 - FIRST
     speed = 0.7 * 9.81 * FIRST
-    height = speed * left - 9.81 * left**2 / 2
+    fallen = 9.81 * left**2 / 2
+    height = speed * left - fallen
     state = height, speed - 9.81 * left
     assert_allclose(until.state, state, rtol=1e-12)
     assert [x.name for x in until.events] == ["bounce"]
@@ -218,7 +219,8 @@ def third_bounce_exactly(height, g, e):
     first = jnp.sqrt(2 * height / g)
     fall = jnp.sqrt(2 * height * g)
     speed = -(e**2) * fall
-    bounces = 1 + 2 * e + 2 * e**2
+    twice = 2 * e**2
+    bounces = 1 + 2 * e + twice
     third = first * bounces
     second = first * (1 + 2 * e)
     return jnp.stack([third, speed, second])
@@ -299,7 +301,8 @@ def test_derivatives_at_a_state_of_rest():
     )
     slope = jax.jit(jax.jacfwd(end))
     own = slope(jnp.zeros(2))
-    expected = true.y[:, -1].reshape(2, 2)
+    at_end = true.y[:, -1]
+    expected = at_end.reshape(2, 2)
     assert_allclose(own, expected, rtol=1e-9)
 
 
@@ -310,7 +313,8 @@ def test_derivatives_where_states_are_small_for_a_moment():
     start = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
 
     def height(k):
-        return hj.flow(hopper.replace(k=k), start, 3.0).state[0]
+        changed = hopper.replace(k=k)
+        return hj.flow(changed, start, 3.0).state[0]
 
     slope = jax.grad(height)(10.0)
     step = 1e-5
@@ -370,14 +374,16 @@ def test_a_flow_that_fails_leaves_the_gradient_of_the_others():
         guesses = hj.Guess("main", starts)
         found = hj.flow(ball(g=g), guesses, 0.9, throw=False)
         _, states = found.at(times)
-        return found.result, found.state[:, 0], states[:, :, 0].sum(axis=1)
+        sums = states[:, :, 0].sum(axis=1)
+        return found.result, found.state[:, 0], sums
 
     def of_each(g):
         def one(start):
             guess = hj.Guess("main", start)
             found = hj.flow(ball(g=g), guess, 0.9)
             _, states = found.at(times)
-            return found.result, found.state[0], states[:, 0].sum()
+            of_samples = states[:, 0].sum()
+            return found.result, found.state[0], of_samples
 
         return jax.vmap(one)(starts)
 
@@ -497,7 +503,8 @@ def test_steps_after_events_are_not_tried_with_the_length_of_the_first_one():
     """That one is a guess, a tenth of the longest duration, and would be rejected each time."""
 
     def fall(t, q, u, p):
-        return q[1], -9.81 - 0.1 * q[1]
+        drag = 0.1 * q[1]
+        return q[1], -9.81 - drag
 
     def bounce(t, q, u, p):
         return q[0], -0.9 * q[1]
@@ -626,12 +633,14 @@ class Pair(hj.HybridSystem):
         def left(t, q, u):
             push = self.push * q[1]
             second = q[3] + push
-            return q[0], -0.5 * q[1], q[2], second
+            left_rate = -0.5 * q[1]
+            return q[0], left_rate, q[2], second
 
         def right(t, q, u):
             push = self.push * q[3]
             first = q[1] + push
-            return q[0], first, q[2], -0.5 * q[3]
+            right_rate = -0.5 * q[3]
+            return q[0], first, q[2], right_rate
 
         return [
             hj.Transition("left", "air", "air", lambda t, q, u: q[0], reset=left),

@@ -8,7 +8,8 @@ import hybridjax as hj
 
 
 ONES = np.ones((4, 1, 1))
-MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), ONES, ONES)
+DECAY = np.full((4, 1, 1), 0.9)
+MODEL = hj.linear.LDTP(DECAY, ONES, ONES)
 USUAL = hj.multisine(4, 16, frequencies=(0, 2.0))
 GOAL = hj.designs.MultiplierGoal(harmonics=0)
 ASKED = dict(noise={"y": 1e-3}, goal=GOAL)

@@ -90,7 +90,8 @@ def test_no_input_gives_the_cycle():
     no_pushes = np.zeros((8, 1))
     path = hj.experiments.perturbed_trajectory(placed, no_pushes)
     last = path.at(path.t[-1:])[1]
-    end = last - path.at(path.t[:1])[1]
+    first = path.at(path.t[:1])[1]
+    end = last - first
     assert_allclose(end, 0, atol=1e-9)
     data = hj.experiments.ExperimentData(
         np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2

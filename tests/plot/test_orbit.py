@@ -10,7 +10,8 @@ from .test_plots import labeled
 def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
     lanes = placed_kinematic.lanes
     push = [0.03, 0, 0, 0]
-    start = np.asarray(lanes.q[:, 0]) + push
+    state = np.asarray(lanes.q[:, 0])
+    start = state + push
     perturbed = hj.simulate(
         hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0])
     )
@@ -51,7 +52,8 @@ def test_bars_lie_on_their_sections(hopper_cycle, placed_kinematic):
     """Rays from the center of the kinematic phase, in equal angles."""
     ax = hj.plot.cycle(hopper_cycle, sections=placed_kinematic).ax
     drawn = labeled(ax)["sections (32)"].get_xydata()
-    bars = drawn.reshape(32, 3, 2)[:, :2]  # the third point is a gap
+    paths = drawn.reshape(32, 3, 2)
+    bars = paths[:, :2]  # the third point is a gap
     middles = bars.mean(axis=1).T
     assert_allclose(middles, placed_kinematic.lanes.q[:2], atol=1e-9)
     scaled = (bars - [1.9, 0.0]) / [0.3, 1.9]
@@ -68,6 +70,7 @@ def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     assert ax.get_xlabel() == "v"
     assert ax.get_ylabel() == "x"
     drawn = labeled(ax)["sections (6)"].get_xydata()
-    bars = drawn.reshape(6, 3, 2)[:, :2]
+    paths = drawn.reshape(6, 3, 2)
+    bars = paths[:, :2]
     middles = bars.mean(axis=1).T
     assert_allclose(middles, placed.lanes.q[::-1], atol=1e-9)

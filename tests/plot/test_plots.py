@@ -28,7 +28,8 @@ def test_magnitude_draws_the_values(estimate, exact):
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
     assert_array_equal(drawn.get_xdata(), estimate.frequencies)
-    modulus = np.abs(estimate[1][:, 1, 0])
+    first_harmonic = estimate[1][:, 1, 0]
+    modulus = np.abs(first_harmonic)
     assert_array_equal(drawn.get_ydata(), modulus)
     assert (
         drawn.get_color()
@@ -56,7 +57,8 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
     f, size = drawn.get_xydata().T
     assert f[0] == 0
     assert f[-1] == 16
-    H = hopper.htf(f, harmonics=0).H[0, :, 0, 0]
+    response = hopper.htf(f, harmonics=0).H
+    H = response[0, :, 0, 0]
     assert_allclose(size, abs(H), rtol=1e-9)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
@@ -90,7 +92,8 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     assert upper.get_ylabel() == "$|H_{0}|$"
     assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
-    assert len(curves) == len(lower.get_lines()) == 2 * 4
+    lower_curves = lower.get_lines()
+    assert len(curves) == len(lower_curves) == 2 * 4
     response = rational.htf(estimate.frequencies)
     fitted = response.H[0, :, 0, 0]
     assert_allclose(curves[2].get_ydata(), np.abs(fitted))
@@ -124,7 +127,8 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     for draw, shown in ((hj.plot.htf, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
-        modulus = np.abs(exact[0][:, 0, 1])
+        H_0 = exact[0][:, 0, 1]
+        modulus = np.abs(H_0)
         assert_allclose(first.get_ydata(), modulus)
         assert_array_equal(first.get_ydata(), second.get_ydata())
     fit = hj.identify.fit_rational(exact, input=1)
@@ -213,7 +217,8 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
     pairs = [(0, 0), (0, 1), (1, 0), (1, 1)]
     names = []
     for curve, (i, j) in zip(curves, pairs, strict=True):
-        modulus = np.abs(two_inputs[0][:, i, j])
+        H_0 = two_inputs[0][:, i, j]
+        modulus = np.abs(H_0)
         assert_allclose(curve.get_ydata(), modulus)
         output = two_inputs.outputs[i]
         source = two_inputs.inputs[j]
@@ -334,7 +339,8 @@ def test_a_crowd_of_multipliers_has_no_inset():
     ticks = np.arange(-4, 5) / 6
     grid = ticks[:, None] + 1j * ticks
     crowd = grid.ravel()
-    ax = hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax
+    apart = crowd + 1e-3
+    ax = hj.plot.multipliers(crowd, {"near": apart}).ax
     assert not ax.child_axes
 
 
@@ -344,7 +350,8 @@ def test_bands_hold_the_values(estimate):
     variance = np.full(estimate.H.shape, 1e-6)
     sure = dataclasses.replace(estimate, variance=variance)
     radius = float(sure.confidence_radius().max())
-    modulus = np.abs(sure[0][:, 0, 0])
+    H_0 = sure[0][:, 0, 0]
+    modulus = np.abs(H_0)
 
     (band,) = hj.plot.htf(sure, harmonics=(0,), output="yM").ax.collections
     heights = band.get_paths()[0].vertices[:, 1]

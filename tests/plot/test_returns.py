@@ -28,7 +28,8 @@ class Logistic(hj.HybridSystem):
         return [jump]
 
     def after(self, t, q, u):
-        return (self.r * q[0] * (1 - q[0]),)
+        rest = 1 - q[0]
+        return (self.r * q[0] * rest,)
 
     def period(self):
         return 1.0
@@ -84,7 +85,8 @@ def test_the_slope_in_several_dimensions_is_the_multiplier():
         lambda t, q, u, p: (1.0 - 0.2 * q[0], q[0] - 0.5 * q[1]),
         period=1.0,
     )
-    cycle = hj.find_limit_cycle(system, hj.Guess("main", (1.0, 1.0)))
+    guess = hj.Guess("main", (1.0, 1.0))
+    cycle = hj.find_limit_cycle(system, guess)
     for coordinate in (None, "x", "y"):
         lines = lines_of(hj.plot.return_map(cycle, coordinate, cobweb=False))
         x, after = lines["return map"]
@@ -106,7 +108,8 @@ def test_states_that_do_not_return_are_gaps():
     assert_array_equal(np.isfinite(after), returns)
     kept = x[np.abs(x) < lost]
     square = kept**2
-    exact = kept / np.sqrt(square + (1 - square) * np.exp(2))
+    left = (1 - square) * np.exp(2)
+    exact = kept / np.sqrt(square + left)
     inner = after[np.abs(x) < lost]
     assert_allclose(inner, exact, atol=1e-9)
 

@@ -32,8 +32,10 @@ def wave():
     t = np.linspace(0.0, 20.0, 2001)
     rng = np.random.default_rng(0)
     x_noise, v_noise = 1e-6 * rng.normal(size=(2, len(t)))
-    x = np.cos(2 * np.pi * t) + x_noise
-    v = -np.sin(2 * np.pi * t) + v_noise
+    cosine = np.cos(2 * np.pi * t)
+    x = cosine + x_noise
+    sine = np.sin(2 * np.pi * t)
+    v = -sine + v_noise
     signals = {"f": np.cos(3 * t), "x": x, "v": v}
     return hj.Recording(t, signals)
 
@@ -58,13 +60,15 @@ def rhythm():
         """Of w = z exp(-2 pi i t), with turn = exp(-2 pi i t)."""
         turned = 2 * np.angle(w) * w
         pull = -1j * DECAY * turned
-        growth = DECAY * (1 - abs(w) ** 2) * w
+        distance = 1 - abs(w) ** 2
+        growth = DECAY * distance * w
         return growth + pull + f * turn
 
     w = 1.0 + 0j
     samples = []
     for k in range(steps * len(force)):
-        phases = -2j * np.pi * halves[2 * k : 2 * k + 3]
+        of_step = halves[2 * k : 2 * k + 3]
+        phases = -2j * np.pi * of_step
         begin, middle, end = np.exp(phases)
         f_begin, f_middle, f_end = fine[2 * k : 2 * k + 3]
         if k % steps == 0:
@@ -76,4 +80,5 @@ def rhythm():
         slopes = a + 2 * b + 2 * c + d
         w = w + h / 6 * slopes
     z = np.array(samples)
-    return hj.Recording(sampled, {"force": force, "x": z.real, "v": z.imag})
+    signals = {"force": force, "x": z.real, "v": z.imag}
+    return hj.Recording(sampled, signals)

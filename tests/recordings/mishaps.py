@@ -29,12 +29,14 @@ class Scene(NamedTuple):
     @property
     def cycles(self):
         """Times since the trial's start, in cycles."""
-        return (self.trial.time - self.trial.time[0]) / self.period
+        elapsed = self.trial.time - self.trial.time[0]
+        return elapsed / self.period
 
     @property
     def from_middle(self):
         """Distances of samples from the middle of the trial, in cycles."""
-        distance = np.abs(self.trial.time - self.trial.time.mean())
+        middle = self.trial.time.mean()
+        distance = np.abs(self.trial.time - middle)
         return distance / self.period
 
     def normal(self):
@@ -120,7 +122,8 @@ def placeholder(value, cycles):
 
 def frozen(which, share):
     def freeze(x, s):
-        first = int((1 - share) / 2 * len(x))
+        part = (1 - share) / 2
+        first = int(part * len(x))
         rows = np.arange(len(x))
         return np.where(
             (rows >= first) & (rows < first + round(share * len(x))), x[first], x
@@ -155,7 +158,8 @@ def renumbered(trial, s):
 
 
 def slow_sensor(x, s):
-    rate = 1 / np.median(np.diff(s.trial.time))
+    step = np.median(np.diff(s.trial.time))
+    rate = 1 / step
     sos = signal.butter(2, 8.0 / s.period, fs=rate, output="sos")
     return signal.sosfilt(sos, x - x[0]) + x[0]
 
@@ -166,7 +170,8 @@ def hidden(choose):
     def hide(trial, s):
         values = trial.values.copy()
         middles = choose(trial.events[s.event], s)
-        distance = np.abs(trial.time[:, None] - middles)
+        apart = trial.time[:, None] - middles
+        distance = np.abs(apart)
         away = distance.min(axis=1) < 0.075 * s.period
         columns = [s.recording.column(x) for x in s.outputs]
         values[np.ix_(away, columns)] = np.nan
@@ -222,7 +227,8 @@ def misjudged(lost=0.0, doubled=0.0, off=0.0):
         doubles = at[again] + 0.05 * s.period
         at = np.concatenate([missed, doubles])
         errors = s.rng.normal(size=len(at))
-        at = np.sort(at + off * s.period * errors)
+        late = off * s.period * errors
+        at = np.sort(at + late)
         return replace(trial, events=trial.events | {s.event: at})
 
     return trials(misjudge)

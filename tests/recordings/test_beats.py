@@ -107,7 +107,8 @@ def test_a_rate_that_wanders_is_no_memory():
     rng = np.random.default_rng(0)
     noise = slow_noise(rng, trials=1, samples=2501, highest=0.5 * 10 / 100)
     force = 2 * noise[0]
-    steps = 0.2 * np.sqrt(0.1) * rng.normal(size=2501)
+    draws = rng.normal(size=2501)
+    steps = 0.2 * np.sqrt(0.1) * draws
     walk = np.cumsum(steps)
     phase = 0.0
     events = []
@@ -120,7 +121,8 @@ def test_a_rate_that_wanders_is_no_memory():
         phase = max(phase + step, 0.0)
         if phase >= 1:
             phase -= 1
-            events.append((k + 1 - phase / step) * 0.01)
+            part = phase / step
+            events.append((k + 1 - part) * 0.01)
     wandering = hj.Recording(
         np.arange(2501) * 0.01, {"u": force}, events={"beat": np.array(events)}
     )
@@ -158,7 +160,8 @@ def test_slopes_are_derivatives(noisy):
 def test_intervals_of_all_lengths_are_no_missed_events():
     """A slow current makes some intervals three times as long as others."""
     times = np.arange(0, 20.0005, 1e-3)
-    slow = 5 * np.sin(np.pi * times)[None]
+    wave = np.sin(np.pi * times)
+    slow = 5 * wave[None]
     slow = hj.testing.simulate_beats([1.0], slow, rate=1000, rhythm=10.0, jitter=0.03)
     (periods,) = hj.recordings.estimate_phase(slow, BEAT).periods
     assert periods.max() > 1.8 * np.median(periods)
@@ -180,7 +183,8 @@ def test_events_alone_are_identified(noisy, tmp_path):
 def slow_noise(rng, trials, samples, highest):
     """Noise of variance 1 up to `highest` cycles per sample."""
     spectrum = np.fft.rfft(rng.normal(size=(trials, samples)))
-    spectrum[:, np.fft.rfftfreq(samples) > highest] = 0
+    frequencies = np.fft.rfftfreq(samples)
+    spectrum[:, frequencies > highest] = 0
     noise = np.fft.irfft(spectrum, samples)
     return noise / noise.std()
 
@@ -218,7 +222,8 @@ def spikes_of_izhikevich(current, noise, adapts, step=0.05):
         middle_w = w + step / 2 * rate_w
         middle_voltage = 0.04 * middle_v**2 + 5 * middle_v + 140
         rate_v = middle_voltage - middle_w + current[:, i]
-        v = v + step * rate_v + noise[:, i]
+        drift = step * rate_v
+        v = v + drift + noise[:, i]
         w = w + step * a * (0.2 * middle_v - middle_w)
         fires = v >= 30
         for k in np.flatnonzero(fires):
@@ -253,7 +258,8 @@ def test_a_push_that_changes_the_next_interval_is_named(adapts):
         hj.Recording(time, {"u": u}, events={"beat": 1e-3 * x}, name=f"trial {k}")
         for k, (u, x) in enumerate(zip(push, spikes, strict=True))
     ]
-    found = hj.recordings.phase_response(hj.Recording.join(trials), BEAT, input="u")
+    joined = hj.Recording.join(trials)
+    found = hj.recordings.phase_response(joined, BEAT, input="u")
     error = np.sqrt(found.covariance[0, 0])
     off = (found.coefficients[0] - truth) / error
     causes = [x.cause for x in found.findings]

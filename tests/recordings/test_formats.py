@@ -75,7 +75,8 @@ def write_v73(path, variables):
         fill(file, variables)
     with open(path, "r+b") as file:
         mark = b"MATLAB 7.3 MAT-file".ljust(124)
-        file.write(mark + bytes([0, 2]) + b"IM")
+        version = bytes([0, 2])
+        file.write(mark + version + b"IM")
 
 
 NESTED = {
@@ -96,7 +97,8 @@ def test_matlab(tmp_path, write):
     np.testing.assert_array_equal(samples(found, "pair.1")[1], 2 * X)
     strikes = found.trials[0].events["strike"]
     np.testing.assert_array_equal(strikes, [0.05, 0.1])
-    write(tmp_path / "y.mat", {"time": SLOW, "x": X, "f": F})
+    signals = {"time": SLOW, "x": X, "f": F}
+    write(tmp_path / "y.mat", signals)
     refused("'f' has the shape .*190.*, but its group 20 times", tmp_path / "y.mat")
     refused(
         "no times 't' for '[ftx]",
@@ -343,7 +345,8 @@ def write_bag(path, version):
     point = kinds["geometry_msgs/msg/Point"]
     stamped = kinds["geometry_msgs/msg/PointStamped"]
     layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
-    image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
+    zeros = np.zeros(1000, np.uint8)
+    image = kinds["std_msgs/msg/UInt8MultiArray"](layout, zeros)
     messages = []
     for t, x in zip(SLOW, X, strict=True):
         seconds = 5 + int(t)
@@ -529,7 +532,8 @@ def test_columns_take_time_in_proportion_to_their_number(tmp_path):
         signals = {Name(f"x{k}"): X for k in range(n)}
         single = hj.Recording(SLOW, {"y": X})
         parts = [hj.Recording(SLOW, signals), single]
-        hj.Recording.join([hj.Recording.beside(parts)] * 2)
+        trial = hj.Recording.beside(parts)
+        hj.Recording.join([trial] * 2)
         counts.append(Name.compared)
     allowed = 3 * max(counts[0], 1)
     assert counts[1] < allowed
@@ -567,7 +571,8 @@ def test_attributes_of_netcdf_apply(tmp_path):
     """A scale, an offset and a mark of missing numbers, in a file of version 4 and of version 3."""
     h5py = pytest.importorskip("h5py")
     y = 4.0 + X
-    stored = np.round((y - 4.0) / 1e-4).astype(np.int32)
+    scaled = (y - 4.0) / 1e-4
+    stored = np.round(scaled).astype(np.int32)
     stored[3] = -32767
     y[3] = np.nan
     path = tmp_path / "new.nc"

@@ -44,7 +44,8 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     for recording in (clean, dirty):
         data.append(hj.recordings.sample_sections(recording, apex, **ABOUT))
         fits.append(hj.fit_series(data[-1], order=2))
-    differs = clean.trials[0].values != dirty.trials[0].values
+    clean_values = clean.trials[0].values
+    differs = clean_values != dirty.trials[0].values
     changed = differs.sum(axis=0)
     missed = np.abs(data[1].spikes - changed)
     assert missed.max() <= 0.05 * max(changed) + 1
@@ -81,7 +82,8 @@ def test_responses_to_pushes(hopper_cycle, angle):
         push = np.exp(-0.5 * distance**2)
         area = push @ found.durations[(m + k) % N]
         response = model.impulse_response(4 * N)
-        value = push @ response[(m + r) % N, r - k, :, 0] / area
+        answers = response[(m + r) % N, r - k, :, 0]
+        value = push @ answers / area
         of_theory = theory[m, r, :, 0]
         np.testing.assert_allclose(of_theory, value, rtol=1e-12)
         size = np.abs(theory).max(axis=(0, 1))

@@ -16,8 +16,10 @@ RATE = 100
 
 def field(t, x, u=0.0):
     """x'' + 2 x' + (30 + 8 cos 2 pi t) x = u."""
-    stiffness = 30 + 8 * np.cos(2 * np.pi * t)
-    return np.array([x[1], u - 2 * x[1] - stiffness * x[0]])
+    wave = np.cos(2 * np.pi * t)
+    stiffness = 30 + 8 * wave
+    acceleration = u - 2 * x[1] - stiffness * x[0]
+    return np.array([x[1], acceleration])
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,8 @@ def recording():
         u[i] = r[i] - 4 * y[0, i] - y[1, i]
         for t in (i * h, i * h + h / 2):  # two steps of the midpoint rule
             force = u[i] + 0.2 * w[i]
-            middle = x + h / 4 * field(t, x, force)
+            slope = field(t, x, force)
+            middle = x + h / 4 * slope
             half_later = t + h / 4
             x = x + h / 2 * field(half_later, middle, u[i] + 0.2 * w[i])
     t = np.arange(n) * h

@@ -38,7 +38,8 @@ def made_up(seed, force=0.1, noise=1e-3):
         angle = 2 * np.pi * time
         noise_x = noise * rng.normal(size=len(f))
         x = 2.0 + np.cos(angle) + w + noise_x
-        swing = -6 * np.sin(angle) + 4 * w * np.cos(angle)
+        forced = 4 * w * np.cos(angle)
+        swing = -6 * np.sin(angle) + forced
         v = swing + noise * rng.normal(size=len(f))
         signals = {"f": f, "x": x, "v": v}
         trials.append(hj.Recording(time, signals, name=f"trial {k}"))
@@ -270,7 +271,8 @@ def test_coarse_stamps_are_named_and_lost_samples_are_not():
     every = np.ones(len(trial.time), bool)
     coarse = np.round(trial.time / 0.007) * 0.007
     assert named(coarse, every) == {"coarse time stamps"}
-    drawn = np.random.default_rng(0).random(len(trial.time))
+    rng = np.random.default_rng(0)
+    drawn = rng.random(len(trial.time))
     lost = drawn < 1 / 3
     assert named(trial.time, every) == set()
     assert "coarse time stamps" not in named(trial.time, ~lost)
@@ -283,7 +285,8 @@ def test_strikes_of_both_sides_are_named(late):
     trials = []
     for trial in recording.trials:
         at = trial.events["top"]
-        middles = (at[1:] + at[:-1]) / 2
+        pairs = at[1:] + at[:-1]
+        middles = pairs / 2
         other = middles + late
         steps = np.sort(np.concatenate([at, other]))
         events = {"step": steps, "top": at}
@@ -321,7 +324,8 @@ def test_a_short_trigger_defines_the_phase(width):
     time = np.arange(0, 40, 0.001)
     rng = np.random.default_rng(0)
     strikes = np.cumsum(rng.uniform(0.9, 1.1, size=37)) + 0.5
-    since = time - strikes[np.searchsorted(strikes, time) - 1]
+    last = np.searchsorted(strikes, time) - 1
+    since = time - strikes[last]
     pulse = 5.0 * ((since >= 0) & (since < width))
     recording = hj.Recording(time, {"trigger": pulse, "x": np.sin(time)})
     crossing = hj.Crossing("trigger", "rising", 2.5)
@@ -340,5 +344,6 @@ def test_the_advice_for_a_clock_that_wraps_undoes_it():
         hj.Recording(wrapped, {"x": time})
     after = str(error.value).split("period=")[1]
     period = float(after.split(")")[0])
-    undone = hj.Recording(np.unwrap(wrapped, period=period), {"x": time})
+    unwrapped = np.unwrap(wrapped, period=period)
+    undone = hj.Recording(unwrapped, {"x": time})
     np.testing.assert_allclose(undone.time, time + 7.0, atol=1e-6)

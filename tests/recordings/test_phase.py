@@ -43,7 +43,8 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
     before, after = windings
     for k, winding in enumerate((before, after)):
         times = times_of_section_0(phase, k)
-        error = np.abs(times - np.round(times)).max()
+        fractions = times - np.round(times)
+        error = np.abs(fractions).max()
         assert error < 0.02 + noise / 2
         assert (np.diff(winding.time) > 0).all()
         assert (np.diff(winding.phase) > 0).all()
@@ -75,7 +76,8 @@ def test_a_signal_that_crosses_at_several_angles_is_no_anchor(wave):
     (trial,) = wave.trials
     _, x, v = trial.values.T
     thrice = np.cos(6 * np.pi * trial.time)
-    recording = hj.Recording(trial.time, {"x": x, "v": v, "w": thrice})
+    signals = {"x": x, "v": v, "w": thrice}
+    recording = hj.Recording(trial.time, signals)
     family = dataclasses.replace(CIRCLE, anchor=hj.Crossing("w", "falling"))
     with pytest.raises(
         hj.errors.DefinitionError, match="w falling, .* all around the cycle"
@@ -100,8 +102,10 @@ def test_irregular_events(seed, jitter):
     missed = 10 + rng.permutation(20)[0]
     doubled = 40 + rng.permutation(10)[0]
     seen = np.delete(t, missed)
-    events = np.sort(np.append(seen, t[doubled] + 0.1))
-    phase = hj.recordings.estimate_phase(recording_of(events), hj.AtEvent("e"))
+    twice = t[doubled] + 0.1
+    events = np.sort(np.append(seen, twice))
+    recording = recording_of(events)
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("e"))
     assert phase.dropped == 1
     assert phase.missed == 2
     allowed = 2 * jitter + 1e-9
@@ -123,7 +127,8 @@ def test_what_is_no_phase(wave):
     t = wave.trials[0].time
     x = np.cos(t) + 5
     v = np.sin(t) + 5
-    still = hj.Recording(t, {"x": x, "v": v, "c": 0 * t})
+    signals = {"x": x, "v": v, "c": 0 * t}
+    still = hj.Recording(t, signals)
     for definition, message in [
         (
             dataclasses.replace(CIRCLE, center=(0, 0), scale=(1, 1)),
@@ -166,7 +171,8 @@ def test_splines_are_those_of_scipy(seed, n, bandwidth):
     y = rng.normal(size=n)
     x = np.linspace(t[0], t[-1], 200)
     step = np.median(np.diff(t))
-    penalty = (2 * np.pi * bandwidth * step) ** -4
+    cutoff = 2 * np.pi * bandwidth * step
+    penalty = cutoff**-4
     smooth = make_smoothing_spline(t / step, y, lam=penalty)
     found = spline(t, y, bandwidth)(x)
     assert_allclose(found, smooth(x / step), atol=1e-9)

@@ -50,7 +50,8 @@ def study(y, error, **columns):
 def test_equal_errors_give_the_t_interval():
     """Hartung and Knapp's interval is then Student's, and the spread what errors leave."""
     y = RNG.normal(size=N)
-    row = study(y, np.full(N, 0.3)).mean("gain")
+    people = study(y, np.full(N, 0.3))
+    row = people.mean("gain")
     error_of_mean = stats.sem(y)
     interval = stats.t.interval(0.95, N - 1, y.mean(), error_of_mean)
     found = (row["low"][0], row["high"][0])
@@ -128,7 +129,8 @@ def test_complete_pairs_give_the_paired_t_test():
     y = np.concatenate([first, second])
     error = np.full(2 * N, 0.01)
     labels = np.repeat(["a", "b"], N)
-    table = {"subject": np.tile(np.arange(N), 2), "condition": labels}
+    names = np.tile(np.arange(N), 2)
+    table = {"subject": names, "condition": labels}
     people = Population(table, {"q": y}, {"q": error})
     row = people.difference("q", "a", "b")
     paired = stats.ttest_rel(first, second)
@@ -208,7 +210,8 @@ def test_moderated_variances_are_closer_to_the_true_ones():
     dof = np.full(400, 6.0)
     true = 1 / strides
     v = true * RNG.chisquare(6, 400) / 6
-    trend = np.column_stack([np.ones(400), np.log(strides)])
+    ones = np.ones(400)
+    trend = np.column_stack([ones, np.log(strides)])
     better = moderated(v, dof, trend)
     moderated_error = np.std(np.log(better / true))
     plain_error = np.std(np.log(v / true))
@@ -245,7 +248,8 @@ def test_plans_agree_with_closed_forms():
     with pytest.raises(
         hj.errors.DefinitionError, match="subjects differ in 'gain' by no more than"
     ):
-        few = study(y, np.ones(12), strides=np.full(12, 100))
+        strides = np.full(12, 100)
+        few = study(y, np.ones(12), strides=strides)
         few.allocation("gain")
     between = np.sqrt(y.var(ddof=1) - 0.01)
     plan = people.allocation("gain", subject_cost=4, trial_cost=1e-9, stride_cost=0.01)
@@ -256,7 +260,8 @@ def test_plans_agree_with_closed_forms():
     expected = stats.nct.sf(
         stats.t.isf(0.025, 22), 22, 0.25 / (spread * np.sqrt(2 / 12))
     )
-    allowed = 3 * np.sqrt(expected * (1 - expected) / 40)
+    variance = expected * (1 - expected)
+    allowed = 3 * np.sqrt(variance / 40)
     assert abs(power - expected) < allowed
 
 
@@ -282,7 +287,8 @@ def test_trials_and_strides_have_the_smallest_variance_for_their_cost():
     trial_counts = np.arange(1, 30)
     stride_counts = np.arange(1, 400)
     k, m = np.meshgrid(trial_counts, stride_counts)
-    spread = subjects + trials / k + 1 / (k * m)
+    by_stride = 1 / (k * m)
+    spread = subjects + trials / k + by_stride
     cost = 4 + 0.5 * k + 0.01 * k * m
     product = spread * cost
     best = np.unravel_index(product.argmin(), product.shape)
@@ -296,7 +302,8 @@ AXES = {"phase": PHASES, "lag": np.arange(8.0)}
 
 
 def maps_of(values, n, **labels):
-    subjects = np.tile(np.arange(n), len(values) // n)
+    repeats = len(values) // n
+    subjects = np.tile(np.arange(n), repeats)
     table = {"subject": subjects} | labels
     return PopulationMaps(table, values, AXES)
 
@@ -304,7 +311,8 @@ def maps_of(values, n, **labels):
 def test_all_sign_flips_give_the_exact_p_value():
     y = RNG.normal(size=(7, 6, 8))
     conditions = np.repeat(["a", "b"], 7)
-    both = maps_of(np.concatenate([y, 0 * y]), 7, condition=conditions)
+    values = np.concatenate([y, 0 * y])
+    both = maps_of(values, 7, condition=conditions)
     test = both.difference("a", "b")
     largest = [
         np.abs(stats.ttest_1samp(np.array(s)[:, None, None] * y, 0).statistic).max()
@@ -313,7 +321,8 @@ def test_all_sign_flips_give_the_exact_p_value():
     t = stats.ttest_1samp(y, 0).statistic
     np.testing.assert_allclose(test.t, t)
     observed = np.abs(t) * (1 - 1e-9)
-    expected = (np.array(largest)[:, None, None] >= observed).mean(axis=0)
+    largest_of_draws = np.array(largest)[:, None, None]
+    expected = (largest_of_draws >= observed).mean(axis=0)
     np.testing.assert_allclose(test.p, expected)
     assert "all 64 sign flips" in test.methods
 
@@ -352,7 +361,8 @@ def test_groups_of_other_sizes_and_spreads_raise_no_alarm():
     for _ in range(120):
         y = smooth(rng, 20)
         y[:6] *= 2.0
-        maps = PopulationMaps(table, y, {"phase": np.arange(24) / 24})
+        phases = np.arange(24) / 24
+        maps = PopulationMaps(table, y, {"phase": phases})
         alarms += maps.difference("a", "b", draws=200).significant.any()
     assert stats.binomtest(alarms, 120, 0.05).pvalue > 0.01
 
@@ -368,12 +378,14 @@ def test_bands_of_skewed_values_hold(groups):
         true = np.exp(0.5)
         if groups:
             y[:7] *= 2.0
-        maps = PopulationMaps(table, y, {"phase": np.arange(24) / 24})
+        phases_of_maps = np.arange(24) / 24
+        maps = PopulationMaps(table, y, {"phase": phases_of_maps})
         if groups:
             found = maps.difference("a", "b", draws=300)
         else:
             found = maps.mean(draws=300)
-        held += (np.abs(found.values - true) <= found.reach).all()
+        apart = np.abs(found.values - true)
+        held += (apart <= found.reach).all()
         assert "values are skewed" in found.methods
     assert stats.binomtest(held, 100, 0.95).pvalue > 0.01
 
@@ -492,7 +504,8 @@ def write_numbers(folder, result, formats):
     assert result.fit.result == Result.OK
     (folder / "report.html").write_text("")
     odd = (Finding("order", "odd."),)
-    hj.save(folder / "fit.npz", dataclasses.replace(result.fit, findings=odd))
+    odd_fit = dataclasses.replace(result.fit, findings=odd)
+    hj.save(folder / "fit.npz", odd_fit)
     (folder / "summary.json").write_text(json.dumps(summarize(result)))
 
 

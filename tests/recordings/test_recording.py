@@ -41,7 +41,8 @@ def test_trials_must_belong_together():
     signals = {"b": T, "a": T}
     other = hj.Recording(T, signals, units={"a": "N"}, name="two")
     both = hj.Recording.join([one, other])
-    second = both.trials[1].values[:, both.column("b")]
+    column = both.column("b")
+    second = both.trials[1].values[:, column]
     np.testing.assert_array_equal(second, T)
     assert "Recording(2 trials: a (N), b)" in repr(both)
     with pytest.raises(
@@ -260,4 +261,5 @@ def test_a_recording_that_is_too_short_is_refused(rhythm, strides):
     inputs, *outputs = rhythm.signals
     names = dict(inputs=inputs, outputs=outputs, n_sections=8)
     with pytest.raises(hj.errors.DefinitionError, match="too few|reach beyond"):
-        hj.identify_recording(short, hj.Crossing(outputs[0], "rising"), **names)
+        crossing = hj.Crossing(outputs[0], "rising")
+        hj.identify_recording(short, crossing, **names)

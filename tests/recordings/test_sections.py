@@ -35,7 +35,8 @@ def sample(recording, phase=CIRCLE, **options):
 
 def test_a_circle(wave):
     data = sample(wave)
-    circle = np.cos(np.pi / 4 * np.arange(8))
+    angles = np.pi / 4 * np.arange(8)
+    circle = np.cos(angles)
     found = data.cycle_outputs[:, 0]
     np.testing.assert_allclose(found, circle, atol=2e-3)
     (record,) = data.records
@@ -106,7 +107,8 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
             t[::step], dict(zip(names, trial.values[::step].T, strict=True))
         )
         data = sample(thin, inputs="force")
-        diagnosis = hj.recordings.diagnose(data, hj.fit_series(data, 1, check=False))
+        fit = hj.fit_series(data, 1, check=False)
+        diagnosis = hj.recordings.diagnose(data, fit)
         named = any(w.cause == "sampling" for w in diagnosis.findings)
         assert named == few
 
@@ -248,9 +250,11 @@ def test_designs_as_tables(tmp_path, wave):
     told = hj.recordings.attach_design(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")
     record = data.records[0]
-    section = (record.first_section + np.arange(len(record.u))) % 8
+    samples = np.arange(len(record.u))
+    section = (record.first_section + samples) % 8
     of_cycle = data.cycle_inputs[section, 0]
-    u = data.records[0].u[:, 0] + of_cycle
+    deviation = data.records[0].u[:, 0]
+    u = deviation + of_cycle
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(
         u[first : first + 150], design.signals(19)[0, :150, 0], atol=1e-9
@@ -317,7 +321,8 @@ def summary(out):
 
 @pytest.mark.slow
 def test_the_summary_of_the_command(summary):
-    (found,) = np.array(summary["multipliers"]) @ [1, 1j]
+    pairs = np.array(summary["multipliers"])
+    (found,) = pairs @ [1, 1j]
     assert abs(found - MULTIPLIER) < 2e-2
     assert summary["held_out_fit_percent"][0] > 80
     assert summary["sampling_rates"] == pytest.approx([64, 64])
@@ -333,7 +338,8 @@ def test_the_page_of_the_command(out, summary):
     assert "p &lt; 0.001" in page or "p = " in page
 
     above_figures = page[: page.index("<img")]
-    (found,) = np.array(summary["multipliers"]) @ [1, 1j]
+    pairs_of_new = np.array(summary["multipliers"])
+    (found,) = pairs_of_new @ [1, 1j]
     assert "± standard error" in above_figures
     assert f"<td>{found.real:.3f}" in above_figures
     assert "from force (N) to x (m), v (m/s)" in above_figures
@@ -420,7 +426,8 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     phases = np.arange(N) / N
     grid = (phases, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
-    times = np.cumsum(np.tile(np.roll(steps, 1), 60))
+    rotated = np.roll(steps, 1)
+    times = np.cumsum(np.tile(rotated, 60))
     found = ImpulseResponses(zero, zero, *grid, 0.0, steps, ("f",), ("x",))
     m = np.arange(N)[:, None]
     r = np.arange(1, 7)
@@ -442,7 +449,8 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
         found = impulse_responses(
             hj.fit_series(record, 1, check=False), data, 4, width=0.0
         )
-        apart.append((found.values - found.of_model(model)) / found.errors)
+        difference = found.values - found.of_model(model)
+        apart.append(difference / found.errors)
     np.testing.assert_allclose(found.durations, steps)
     size = np.sqrt(
         np.mean(np.array(apart)[:, :, [[1, 2, 3, 4], [13, 14, 15, 16]]] ** 2, (0, 1, 3))

@@ -47,7 +47,8 @@ def pulse(width):
 
 
 SIGNS = np.where(np.arange(len(T)) % 2, 1, -1)
-RINGING = np.exp(-40 * (T % 1)) * SIGNS
+decay = np.exp(-40 * (T % 1))
+RINGING = decay * SIGNS
 
 
 @pytest.mark.parametrize(
@@ -68,7 +69,8 @@ RINGING = np.exp(-40 * (T % 1)) * SIGNS
     ],
 )
 def test_what_is_no_spike(x):
-    noise = 1e-5 * np.random.default_rng(3).normal(size=len(x))
+    draws = np.random.default_rng(3).normal(size=len(x))
+    noise = 1e-5 * draws
     for values in (x, x + noise):
         assert not spike_heights(values).any()
 
@@ -82,7 +84,8 @@ def test_pulses_are_the_input_and_spikes_are_not():
     assert found[single > 0].all()
     assert not input_spikes(single).any()
     assert not input_spikes(noisy(single, 0.1)).any()
-    force = hj.experiments.random_input(40, 500, 8)[:, 0]
+    inputs = hj.experiments.random_input(40, 500, 8)
+    force = inputs[:, 0]
     assert not input_spikes(force).any()
     rng = np.random.default_rng(0)
     held = np.repeat(rng.normal(size=5000), 4)

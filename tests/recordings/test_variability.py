@@ -31,8 +31,10 @@ def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         x = 0.0
         y = []
         for n in range(count * N):
-            y.append(gains[n % N] * np.real(x))
-            x = multiplier ** (1 / N) * x + rng.normal()
+            value = gains[n % N] * np.real(x)
+            y.append(value)
+            decayed = multiplier ** (1 / N) * x
+            x = decayed + rng.normal()
         y = np.array(y)
         places = np.arange(len(y))[:, None]
         slow = drift * np.sin(places / 800)
@@ -59,7 +61,8 @@ def test_a_recording_without_inputs_is_identified_by_its_variability(tmp_path):
     fit = hj.load(tmp_path / "report" / "fit.npz")
     population = hj.recordings.Population.from_fits([fit], {"subject": ["S1"]})
     modulus = result.fit.modulus[0]
-    half_life = np.log(2) / population.values["decay"][0]
+    decay = population.values["decay"][0]
+    half_life = np.log(2) / decay
     assert modulus**half_life == pytest.approx(0.5)
     with pytest.raises(hj.errors.DefinitionError, match="name `inputs`, too"):
         hj.identify_recording(recording, hj.AtEvent("e"), references="y0", **options)
@@ -127,14 +130,16 @@ def require_no_finding(cause, fit):
 
 def test_short_records_are_drawn_whole():
     """No interval is narrow because a record holds only one block."""
-    found = hj.recordings.natural_multipliers(variable(0.1, strides=(5,) * 12))
+    short = variable(0.1, strides=(5,) * 12)
+    found = hj.recordings.natural_multipliers(short)
     assert np.ptp(found.interval()) > 0.2
     assert any(text.cause == "few cycles" for text in found.findings)
     assert found.block * found.records == found.cycles
     assert (
         np.ptp(hj.recordings.natural_multipliers(variable(0.1, (11,))).interval()) > 0.2
     )
-    many = hj.recordings.natural_multipliers(variable(0.1, (20,) * 60))
+    longer = variable(0.1, (20,) * 60)
+    many = hj.recordings.natural_multipliers(longer)
     assert abs(many.multipliers[0] - 0.6) < 0.06  # (0.13 without the correction)
 
 
@@ -153,7 +158,8 @@ def turning(modulus, angle, cycles, seed):
     for k in range(1, len(z)):
         noise = rng.normal() + 1j * rng.normal()
         turn = modulus ** (1 / N) * np.exp(1j * angle / N)
-        z[k] = turn * z[k - 1] + noise
+        turned = turn * z[k - 1]
+        z[k] = turned + noise
     signals = {"a": z.real, "b": z.imag}
     recording = hj.Recording(
         np.arange(len(z)) / N, signals, events={"e": np.arange(cycles)}

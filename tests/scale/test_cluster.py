@@ -28,7 +28,8 @@ class Plane(hj.Chart):
 
     def field(self, t, q, u):
         push = u[0] + jnp.cos(2 * jnp.pi * t)
-        return q[1], push - 20.0 * q[0] - 1.0 * q[1]
+        spring = 20.0 * q[0]
+        return q[1], push - spring - 1.0 * q[1]
 
 
 class Driven(hj.HybridSystem):
@@ -45,7 +46,8 @@ def walk(rng):
     """A random computation that takes a while."""
     time.sleep(0.02)
     steps = rng.normal(size=(STEPS, 2)).cumsum(axis=0)
-    return {"end": steps[-1], "far": np.abs(steps).max()}
+    farthest = np.abs(steps).max()
+    return {"end": steps[-1], "far": farthest}
 
 
 def fails(rng):
@@ -228,9 +230,11 @@ def test_workers_with_other_code_are_refused(client, monkeypatch):
 @pytest.fixture(scope="module")
 def experiments():
     """A stable linear oscillator with a clock: compiled in a moment."""
-    cycle = hj.find_limit_cycle(Driven(), hj.Guess("all", (0.0, 0.0)))
+    guess = hj.Guess("all", (0.0, 0.0))
+    cycle = hj.find_limit_cycle(Driven(), guess)
     rng = np.random.default_rng(0)
-    u = 0.1 * rng.normal(size=(6, 4 * 14, 1))
+    draws = rng.normal(size=(6, 4 * 14, 1))
+    u = 0.1 * draws
     return cycle, hj.ClockPhase(4), u, "x"
 
 

@@ -43,7 +43,8 @@ def whole(wheel, options):
 
 def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     """That of the rimless wheel is cos^2 of the angle between spokes (McGeer 1990)."""
-    multiplier = np.cos(2 * np.pi / OVER["spokes"]) ** 2
+    angle = 2 * np.pi / OVER["spokes"]
+    multiplier = np.cos(angle) ** 2
     expected = np.broadcast_to(multiplier, (3, 3))
     assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
     assert whole.spectral_radius.dims == ("slope", "spokes")
@@ -68,7 +69,8 @@ def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
     assert np.flatnonzero(found.result).tolist() == [2]
     assert np.isnan(found.period[2])
-    multiplier = np.cos(2 * np.pi / found.spokes.values) ** 2
+    angle = 2 * np.pi / found.spokes.values
+    multiplier = np.cos(angle) ** 2
     expected = np.delete(multiplier, 2)
     assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
 
@@ -100,7 +102,8 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
     with pytest.raises(
         hj.errors.DefinitionError, match=r"`values.slope` is not the same"
     ):
-        run(over=small | {"slope": np.array([0.071, 0.08])})
+        other = small | {"slope": np.array([0.071, 0.08])}
+        run(over=other)
     with pytest.raises(
         hj.errors.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
     ):
@@ -134,7 +137,8 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
     assert found.period.dims == ("point",)
     assert set(found.coords) == {"slope", "spokes"}
-    expected = whole.period.values[::2, ::2].T.ravel()
+    part = whole.period.values[::2, ::2]
+    expected = part.T.ravel()
     assert_allclose(found.period, expected, rtol=1e-9)
     period = float(found.period[0])
     expected = period * np.array([1, 2])

@@ -57,7 +57,8 @@ class FallingPast(Chosen):
 
 
 def test_a_family_of_clock_phases(hopper_cycle):
-    placed = hj.sections.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
+    family = Chosen([0.1, 0.25, 0.8])
+    placed = hj.sections.place_sections(hopper_cycle, family)
     phases = placed.lanes.t % 1
     assert_allclose(phases, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")

@@ -40,11 +40,13 @@ def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochro
 
 def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
     data = reference("htf_exact_isochron")
-    values = np.asarray(isochron_ldtp.htf(data["f"]).H)[..., 0]
+    response = isochron_ldtp.htf(data["f"])
+    values = np.asarray(response.H)[..., 0]
     H = values.transpose(1, 0, 2)
     modulus = np.abs(data["H"][:, 16])
     largest = modulus.max(axis=0)
-    error = np.abs(H - data["H"]).max(axis=(0, 1))
+    apart = np.abs(H - data["H"])
+    error = apart.max(axis=(0, 1))
     assert np.all(error <= 1e-8 * largest)
 
 
@@ -188,7 +190,8 @@ def test_delays_agree_with_finer_sections(hopper_cycle, late_input, late_output)
     u = rng.normal(size=(24, 1))
     rest = np.zeros((N + late_input, 1))  # a period before the input begins
     held = np.repeat(u, finer, axis=0)
-    y = np.asarray(fine.simulate(np.concatenate([rest, held])))
+    inputs = np.concatenate([rest, held])
+    y = np.asarray(fine.simulate(inputs))
     expected = y[N - late_output :: finer][: len(u)]
     tolerance = 1e-11 * np.abs(expected).max()
     assert_allclose(model.simulate(u), expected, atol=tolerance)
@@ -240,7 +243,8 @@ MOST = hj.Crossing("v", "rising", 0.8)
     [([HALF, hj.AtEvent("spike")], [0, 1]), ([HALF, MOST], [0, 0]), (HALF, [0])],
 )
 def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, dims):
-    cycle = hj.find_limit_cycle(_Neuron(), hj.Guess("below", (0.5,)))
+    guess = hj.Guess("below", (0.5,))
+    cycle = hj.find_limit_cycle(_Neuron(), guess)
     # The voltage of a section does not change, the current does.
     current = hj.Output("current", lambda t, q, u: 3 * q[0] + 2 * u[0])
     model = hj.linearize(cycle, sections, outputs=current)
@@ -257,7 +261,8 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, di
     closed = model.feedback(np.zeros((1, 1)))
     assert_allclose(closed.simulate(ones), 2 * ones)
 
-    design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
+    whole_design = hj.multisine(len(dims), 8, inputs="u")
+    design = whole_design.scaled(0.01)
     data = hj.run_experiments(cycle, sections, design, current, start="periodic")
     assert_allclose(data.y, 2 * data.u, rtol=1e-9)
 
@@ -266,13 +271,15 @@ def test_a_section_map_waits_for_late_arrivals():
     """A ball 3 m/s faster than on the cycle flies for two periods: alone and inside of programs."""
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     paddle = hj.sections.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
-    state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
+    fixed = np.asarray(paddle.fixed_point)
+    state = fixed + np.array([0.0, 3.0])
     placed = hj.sections.place_sections(cycle, [hj.AtEvent("impact")])
     begin = float(placed.lanes.t[0])
     path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
     alone = paddle(state)
     inside = eqx.filter_jit(paddle)(state)
-    both = jax.vmap(paddle)(np.stack([state, state]))
+    twice = np.stack([state, state])
+    both = jax.vmap(paddle)(twice)
     duration = float(alone.t) - begin
     assert duration > 1.5 * float(cycle.period)
     for t in (alone.t, inside.t, both.t[1]):
@@ -287,7 +294,8 @@ def test_second_derivatives_of_a_period():
         return hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), cycle).period
 
     h = 1e-3
-    change = period(1 + h) - 2 * period(1.0) + period(1 - h)
+    middle = 2 * period(1.0)
+    change = period(1 + h) - middle + period(1 - h)
     second = change / h**2
     exact = jax.jacrev(jax.jacfwd(period))(1.0)
     assert_allclose(exact, second, rtol=1e-5)

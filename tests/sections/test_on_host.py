@@ -124,7 +124,8 @@ def test_numbers_of_sections(hopper_cycle):
         return hj.linearize(hopper_cycle, sections, "yM").C[0, 0, 0]
 
     e = 1e-4
-    differences = (determinant(e) - determinant(-e)) / (2 * e)
+    change = determinant(e) - determinant(-e)
+    differences = change / (2 * e)
     assert_allclose(jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9)
 
 
@@ -156,7 +157,8 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
         trace = jax.numpy.trace(monodromy)
         square = jax.numpy.trace(monodromy @ monodromy)
         determinant = (trace**2 - square) / 2
-        root = jax.numpy.sqrt(determinant - trace**2 / 4)
+        distance = determinant - trace**2 / 4
+        root = jax.numpy.sqrt(distance)
         return jax.numpy.stack([trace / 2, root])
 
     slopes = eqx.filter_jit(eqx.filter_jacfwd(multiplier))(hopper_cycle.system)

@@ -64,10 +64,12 @@ def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
 def test_an_angle_as_the_anchor(hopper_cycle):
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     placed = hj.sections.place_sections(hopper_cycle, family)
-    height, speed = np.asarray(placed.lanes.q)[:2]
+    states = np.asarray(placed.lanes.q)
+    height, speed = states[:2]
     height_in_sizes = (height - 1.9) / 0.3
     angle = np.unwrap(np.arctan2(speed / 1.9, height_in_sizes))
-    expected = 0.3 - np.pi / 2 * np.arange(4)
+    quarters = np.pi / 2 * np.arange(4)
+    expected = 0.3 - quarters
     assert_allclose(angle, expected, atol=1e-10)
 
 
@@ -243,13 +245,15 @@ def families_of(cycle):
     for transition in sorted(set(cycle.event_sequence)):
         families.append([AtEvent(structure.transitions[transition].name)])
     for state in names:
-        values = q[:, structure.charts[0].states.index(state)]
+        place = structure.charts[0].states.index(state)
+        values = q[:, place]
         level = 0.53 * values.min() + 0.47 * values.max()
         rising = Crossing(state, "rising", level)
         falling = Crossing(state, "falling", level)
         families.append([rising, falling])
         families.append(hj.ClockPhase(5, falling))
-        families.append(hj.sections.ArcLength(5, names[:1], rising))
+        curve = hj.sections.ArcLength(5, names[:1], rising)
+        families.append(curve)
     if len(names) == 2:
         center = q[:, :2].mean(axis=0)
         families.append(hj.KinematicPhase(9, *names, center=center))
@@ -324,7 +328,8 @@ def states_of(tape):
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     (impact, *_) = wheel.trajectory().events
-    at_impact = hj.ClockPhase(2, anchor=float(impact.time / wheel.period))
+    phase = float(impact.time / wheel.period)
+    at_impact = hj.ClockPhase(2, anchor=phase)
     with pytest.raises(
         hj.errors.ComputationError, match="section coincides with an event"
     ):

@@ -28,7 +28,8 @@ class Mark(eqx.Module):
         return q[0] - self.levels[self.i]
 
     def reset(self, t, q, u):
-        return q.at[2].add(self.weight * 10.0**self.i)
+        change = self.weight * 10.0**self.i
+        return q.at[2].add(change)
 
     def enabled(self, t, q, u):
         return q[2] < 700.0
@@ -129,6 +130,7 @@ def test_jacobians_are_those_of_each():
         end, lanes, target, done = flow(
             s, 0.0, np.array([*START[:2], 1.0]), np.zeros(s.nu), 3.0
         )
-        jacobian = chain(s, lanes, target, done.tape, of_states=True)[0][0]
+        found = chain(s, lanes, target, done.tape, of_states=True)
+        jacobian = found[0][0]
     assert end[3] == 6.0  # three different factors
     assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)

@@ -346,7 +346,8 @@ def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypa
     response = hj.experiments.response_function(swinging, PLACES, SPEED)
     chunks = hj.run_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
     placed = hj.sections.place_sections(swinging, hj.ClockPhase(2, anchor=level))
-    before = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
+    model = hj.linearize(swinging, PLACES, SPEED)
+    before = model.C[0, 0, 0]
     monkeypatch.setitem(globals(), "GAIN", 2.0)
     uses = {
         "Output 'speed' has changed since this response function was made": (
@@ -362,5 +363,6 @@ def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypa
     for sentence, use in uses.items():
         with pytest.raises(hj.errors.DefinitionError, match=sentence):
             use()
-    after = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
+    model_after = hj.linearize(swinging, PLACES, SPEED)
+    after = model_after.C[0, 0, 0]
     assert_allclose(after, 2 * before, rtol=1e-12)

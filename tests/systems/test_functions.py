@@ -44,9 +44,11 @@ def test_a_network_and_a_scan():
         before = W @ [x, np.cos(t)]
         hidden = np.tanh(before + np.asarray(first.bias))
         output = V @ hidden + np.asarray(second.bias)
-        by_hidden = (1 - hidden**2) * W[:, 0]
+        slope_of_tanh = 1 - hidden**2
+        by_hidden = slope_of_tanh * W[:, 0]
         slope = V @ by_hidden
-        polynomial = -0.1 * x**2 + 0.2 * x + 0.3
+        square = -0.1 * x**2
+        polynomial = square + 0.2 * x + 0.3
         rate = -x + output[0] + polynomial
         by_x = -1 + slope[0] - 0.2 * x + 0.2
         return [rate, by_x]

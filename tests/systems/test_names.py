@@ -20,7 +20,8 @@ class Plane(hj.Chart):
     def field(self, t, q, u):
         x, y = q
         growth = 1 - x**2 - y**2
-        x_rate = growth * x - ANGULAR * y + u[0]
+        turn = ANGULAR * y
+        x_rate = growth * x - turn + u[0]
         y_rate = growth * y + ANGULAR * x
         return x_rate, y_rate
 

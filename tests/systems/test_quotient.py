@@ -28,7 +28,8 @@ class Stands(hj.Chart):
         step = self.walker.charts()["step"]
         state = seen(q, self.leg)
         a, b, w, v = step.field(t, state, u)
-        swing = jnp.cos(q[self.leg]) * q[2 + self.leg]
+        cosine = jnp.cos(q[self.leg])
+        swing = cosine * q[2 + self.leg]
         rate = swing - self.drag * q[4]
         return told(self.leg, a, b, w, v, rate)
 
@@ -74,7 +75,8 @@ class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
 
     def guess(self):
         th, phi, w, p = hj.models.SimplestWalker().guess().state
-        return hj.Guess("left stands", told(0, th, phi, w, p, 0.0))
+        state = told(0, th, phi, w, p, 0.0)
+        return hj.Guess("left stands", state)
 
 
 FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})

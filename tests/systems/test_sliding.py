@@ -20,7 +20,8 @@ def test_a_block_on_a_belt_sticks_and_slips():
     decay = 3.0
 
     def slip(t, q):
-        friction = F / (1 + decay * (belt - q[1]))
+        behind = belt - q[1]
+        friction = F / (1 + decay * behind)
         return [q[1], -q[0] + friction]
 
     def caught(t, q):
