@@ -57,7 +57,8 @@ class Converter(hj.HybridSystem):
 
 def at_tick(duty):
     """x on the limit cycle where a period begins, in closed form."""
-    rise = np.exp(duty - 1) - np.exp(-1)
+    empty = np.exp(-1)
+    rise = np.exp(duty - 1) - empty
     return rise / (1 - np.exp(-1))
 
 

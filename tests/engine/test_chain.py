@@ -31,7 +31,8 @@ def flow(s, t, q, u, end):
     sizes = np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
     options = Options(True, tangents=True)
-    done = move(s, lanes, u[:, None], target, settings, options=options)
+    inputs = u[:, None]
+    done = move(s, lanes, inputs, target, settings, options=options)
     moved = done.moved.lanes
     state = moved.q[:, 0]
     after = np.concatenate([moved.t, state])
@@ -67,7 +68,8 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
     inputs = range(1 + s.d, len(x))
     with unchecked_host():
         _, lanes, target, done = run(x)
-        jacobian = chain(s, lanes, target, done.tape, of_states=False)[0][0]
+        found = chain(s, lanes, target, done.tape, of_states=False)
+        jacobian = found[0][0]
         events = events_of(done)
         assert len(events) > 0
         for k in (0, *states, *inputs):

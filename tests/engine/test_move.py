@@ -83,7 +83,8 @@ def test_lanes_fail_one_by_one():
     end = jnp.full(4, 0.6)
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
-    moved = move(s, lanes, u, until(end), tight(s)).moved
+    target = until(end)
+    moved = move(s, lanes, u, target, tight(s)).moved
     bad = hj.errors.Result.BAD_INPUT
     zeno = hj.errors.Result.ZENO
     codes = [hj.errors.Result.OK, bad, zeno, bad]

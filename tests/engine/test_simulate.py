@@ -374,7 +374,8 @@ def test_a_first_step_that_is_far_too_long_is_rejected(duration):
     """A tenth of the time makes 1e34 of 1, and even more of rounding errors."""
 
     def duffing(t, q, cos):
-        spring = -0.3 * q[1] - q[0] - q[0] ** 3
+        cubic = q[0] ** 3
+        spring = -0.3 * q[1] - q[0] - cubic
         push = 0.3 * cos(1.2 * t)
         return q[1], spring + push
 

@@ -170,7 +170,8 @@ def test_derivatives_of_implicit_steps(solver):
 
     def end(x):
         def field(t, q, x=x):
-            distance = q[0] - jnp.sin(q[1] + x)
+            wave = jnp.sin(q[1] + x)
+            distance = q[0] - wave
             fast = -50.0 * distance
             slow = q[0] * q[1] + x
             return jnp.stack([fast, slow])
@@ -217,7 +218,8 @@ def test_linearization_of_a_stiff_system(damped):
     )
     A = model.A[0]
     B = model.B[0]
-    size = np.array([damped.scale["y"], damped.scale["v"]])
+    scales = [damped.scale["y"], damped.scale["v"]]
+    size = np.array(scales)
     ratio = size / size[:, None]
     found = A * ratio
     exact = exactly[:2, :2] * ratio

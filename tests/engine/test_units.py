@@ -25,7 +25,8 @@ SIZES = np.array([[2.0, 2.0, 0.3, 4.0], [2.0, 2.0, 1.0, 1.0]])
 
 def sizes(length, time):
     """By which the hopper's states are multiplied."""
-    ratios = jnp.array([1.0, 1 / time, 1.0, 1 / time])
+    rate = 1 / time
+    ratios = jnp.array([1.0, rate, 1.0, rate])
     return length * ratios
 
 
@@ -114,7 +115,8 @@ def test_a_chain_of_integrators_from_zero():
 
     found = simulate_rates(integrators, (0.0, 0.0, 0.0, 0.0, 0.0))
     t = 10.0
-    bent = np.cos(t) - 1 + t**2 / 2
+    parabola = t**2 / 2
+    bent = np.cos(t) - 1 + parabola
     slope = t - np.sin(t)
     expected = [bent, slope, 1 - np.cos(t), np.sin(t)]
     end = found.after[-1][1:]

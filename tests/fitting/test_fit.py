@@ -55,7 +55,8 @@ def test_the_unit_of_residuals_does_not_count():
 
 
 def test_errors_that_no_residual_shows_are_unknown():
-    juggler, impact = hj.models.PaddleJuggler(), [hj.AtEvent("impact")]
+    juggler = hj.models.PaddleJuggler()
+    impact = [hj.AtEvent("impact")]
     cycle = hj.fitting.ObservedCycle(impact, times=[0.15])
     fit = hj.fit_model(juggler, cycle, "A")
     assert fit.result == hj.errors.Result.OK
@@ -179,7 +180,8 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
 
 def test_advice_about_searches_names_their_function(oscillation):
     still, data = Oscillator(w=0.0), observed(oscillation)
-    far, free = hj.Guess("charge", (9e9, 0.0)), ("p",)
+    far = hj.Guess("charge", (9e9, 0.0))
+    free = ("p",)
     for call in (
         lambda: hj.fit_model(still, data, free, guess=far),
         lambda: hj.fitting.identifiability(still, data, free, guess=oscillation),

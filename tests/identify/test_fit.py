@@ -77,7 +77,8 @@ def test_fits_of_multipliers_are_fits(fits):
         found = np.sort(fit.multipliers.real)
         apart = np.abs(found - np.sort(MULTIPLIERS))
         assert apart.max() < 0.02
-        assert fit.covariance.shape == (2, 2) and fit.dof > 100, name
+        has_size = fit.covariance.shape == (2, 2)
+        assert has_size and fit.dof > 100, name
         assert fit.findings == (), f"{name}: {fit.findings}"
         low, high = fit.interval(0.99).T
         covers_low = (low < fit.multipliers.real).all()

@@ -271,7 +271,8 @@ def test_whether_outputs_answer_at_once_is_found(plant):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
         white = np.random.default_rng(0).normal(size=data.y.shape)
         noise = 0.1 * white
-        moved = {"u": data.u + 10, "y": data.y + noise + 10, "drift": np.inf}
+        outputs = data.y + noise + 10
+        moved = {"u": data.u + 10, "y": outputs, "drift": np.inf}
         fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, references="r")
         has_direct = bool(np.asarray(fit.model.D).any())
         assert has_direct == bool(through)

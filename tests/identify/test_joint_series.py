@@ -29,7 +29,8 @@ def driven(model, size, sensor=0.1):
     """Noise that enters where the inputs do, and noise of the sensors."""
     shape = (model.n_sections, 2, 2)
     still = np.broadcast_to(sensor * np.eye(2), shape)
-    none = np.zeros((*model.B.shape[:2], 2))
+    before_inputs = model.B.shape[:2]
+    none = np.zeros((*before_inputs, 2))
     B = np.concatenate([size * model.B, none], axis=2)
     D = np.concatenate([size * model.D, still], axis=2)
     return hj.linear.LDTP(model.A, B, model.C, D, model.dims, outputs=model.outputs)

@@ -87,7 +87,8 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     number = np.full(runs, 1.0 * R)
     shape = roundness(square, turned, number)
     dof = np.full(runs, R - 1.0)
-    variance_dof = hj.linear.VarianceDof(dof, shape[None, :, None, None])
+    by_line = shape[None, :, None, None]
+    variance_dof = hj.linear.VarianceDof(dof, by_line)
     for level in (0.5, 0.8, 0.95, 0.99):
         quantiles = np.asarray(variance_dof.quantile(level))
         quantile = quantiles[0, :, 0, 0]

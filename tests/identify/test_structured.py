@@ -41,4 +41,5 @@ def test_random_systems(shape, seed):
     assert_allclose(fit.coefficients, exact, atol=1e-8)
     error = fit.htf(htf.frequencies).error(htf)
     assert error.max() < 1e-8
-    assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)
+    lags = 3 * N + 1
+    assert fit.numerators.shape == (N, lags, ny, nu)

@@ -86,7 +86,8 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
         signs = rng.choice([-1.0, 1.0], N)
         section = np.arange(N * 80) % N
         hidden = signs[section] * data.u[:, 0]
-        response = np.asarray(small.simulate(data.u))[:, 1]
+        outputs = np.asarray(small.simulate(data.u))
+        response = outputs[:, 1]
         size = np.sqrt(np.mean(response**2))
         found = hj.validate(small, data)
         hidden_size = np.sqrt(np.mean(hidden**2))

@@ -128,7 +128,8 @@ def onto(section, point, names):
     else:
         assert "yM" not in names
         ratio = point[2] / 1.9
-        point[1] = 1.9 + 0.3 * ratio / np.tan(value)
+        shift = 0.3 * ratio / np.tan(value)
+        point[1] = 1.9 + shift
     return point
 
 

@@ -427,7 +427,8 @@ def _least_current(R):
     turn = expm(off * 10e-6) @ turn_on
     unit = np.eye(2)
     back = unit - turn[:2, :2]
-    return np.linalg.solve(back, turn[:2, 2])[1]
+    forcing = turn[:2, 2]
+    return np.linalg.solve(back, forcing)[1]
 
 
 @pytest.mark.slow

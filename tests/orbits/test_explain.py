@@ -127,7 +127,8 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     is_impact = (orbit.event >= 0) & is_late
     row = np.flatnonzero(is_impact)[0]
     y, v = orbit.before[row, :2]
-    height = y - v * half - 9.81 * half**2 / 2
+    fallen = 9.81 * half**2 / 2
+    height = y - v * half - fallen
     ball = [height, v + 9.81 * half]
     start = np.array([*ball, *ball])
     fall = np.kron(np.eye(2), [[1.0, half], [0.0, 1.0]])

@@ -24,7 +24,8 @@ class Free(hj.Chart):
         x, v = q
         s = self.system
         push = s.drive * jnp.cos(s.rate * t)
-        return v, -x - s.damping * v + push + u[0]
+        spring = -x - s.damping * v
+        return v, spring + push + u[0]
 
 
 class Rebound(hj.HybridSystem):

@@ -444,7 +444,8 @@ def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_t
     f = np.array([0.3, 1.7])
     m = np.arange(-3, 4)
     H = cycle.htf(f, m, ("y", "v")).H
-    y, v = np.moveaxis(H[..., 0], -1, 0)
+    outputs = H[..., 0]
+    y, v = np.moveaxis(outputs, -1, 0)
     rates = 2j * np.pi * (f + m[:, None])
     assert_allclose(v, rates * y, rtol=1e-9)
 
@@ -552,7 +553,10 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         )
         responses = cycle.responses(modes=2 * guess.clocked)
         at = jnp.array([0.3])
-        push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
+        if guess.clocked:
+            push = responses.amplitude(0, at)
+        else:
+            push = responses.phase(at)
         H = cycle.htf(0.3, 1, output).H
         htf = H[0, 0, 0, 0]
         noise = cycle.fluctuations({output: 0.1})
