@@ -173,6 +173,9 @@ def linear(t):
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
     )
+
+
+def transfer_functions(t):
     f = np.asarray(t.estimate.frequencies)
     H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
@@ -206,7 +209,7 @@ def linear(t):
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
-    yield htf.predict, dict(u=u)
+    yield htf.predict, dict(u=np.ones((12, 2)))
     for name in ("error", "harmonic_errors"):
         yield getattr(htf, name), dict(other=t.exact)
 
@@ -565,6 +568,7 @@ PARTS = (
     sections,
     cycles,
     linear,
+    transfer_functions,
     designs,
     experiments,
     estimates,
