@@ -502,8 +502,7 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     moved = np.intersect1d(code, varied).astype(int)
     for g in moved.tolist():
         now = np.flatnonzero(code == g)
-        due_of = kernels.due(s, g, t[now], q[:, now], u[:, now])
-        rows_due = due_of
+        rows_due = kernels.due(s, g, t[now], q[:, now], u[:, now])
         due = rows_due[0]
         by_parameter = due[2 + n :].T
         longer[now, 0, 1 + n :] = by_parameter

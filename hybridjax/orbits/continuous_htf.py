@@ -174,7 +174,8 @@ def _transfer(
     begin, delay, end = flow.driven(inside)
     H = _integrals(map, flow, z, harmonics, inside, begin, delay)
 
-    H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1)
+    of_end = xp.moveaxis(end, -1, 0)
+    H = xp.concatenate([H, of_end], axis=1)
     at_f = fine @ H.reshape(len(coarse), -1)
     at_f = at_f.reshape(len(f), rows + d, -1)
     H, end = xp.split(at_f, [rows], axis=1)
@@ -186,7 +187,8 @@ def _transfer(
     turns = -2j * np.pi * f
     back_a_period = xp.exp(turns)[:, None, None]
     turned = xp.eye(d) - back_a_period * scaled
-    start = solve(turned, end[..., :nu] / column) * column
+    right = end[..., :nu] / column
+    start = solve(turned, right) * column
     by_input = H[..., :nu]
     by_start = H[..., nu:]
     H = by_input + by_start @ start

@@ -279,8 +279,8 @@ def _on_section(
 
 def _across(map: ReturnMap, a: int, q: np.ndarray, f: np.ndarray) -> Crossing:
     """The plane through a state of chart a that is orthogonal to the field there, in sizes."""
-    scale = np.asarray(map.scale)[a, : len(q)]
-    sizes = scale
+    scale = np.asarray(map.scale)
+    sizes = scale[a, : len(q)]
     length = np.linalg.norm(f / sizes)
     normal = f / sizes**2 / length
     plane = _Plane(real(q), real(normal))

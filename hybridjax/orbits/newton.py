@@ -146,7 +146,8 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     levels = None if ends.levels is None else ListLevels((by.base,))
     s = kernels.Tangents(map.structure, by.structure, ends.levels, levels, P)
     begin = np.zeros((1 + len(sizes), P))
-    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
+    if by.anchor.t is not None:
+        begin[0] = by.anchor.t[:, 0]
     longer = np.zeros(P) if by.expected is None else by.expected
     along = begin[0][:, None] + np.outer(
         longer, (ends.time - map.anchor.t) / map.expected
@@ -181,7 +182,9 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
             ),
             factors=np.moveaxis(by_factor.imag / kernels.TINY, 1, 0),
         )
-    t_anchor = None if by.anchor.t is None else begin[0][:, None]
+    t_anchor = None
+    if by.anchor.t is not None:
+        t_anchor = begin[0][:, None]
     q = begin[1:].T[..., None]
     anchor = nothing.anchor._replace(t=t_anchor, q=q)
     return solution, nothing._replace(anchor=anchor, turn=moving)
@@ -266,7 +269,9 @@ def _by_rough_turns(
     pieces = moves and follow_moves(
         map, map.departure(x * map.sizes), map.ends(), moves
     )
-    x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
+    moves = None
+    if pieces:
+        x, moves = fixed_point(map, pieces[::2], x)
     return x, moves, steps, turn
 
 
@@ -276,7 +281,9 @@ def _newton(
     """Newton's method from a state, in sizes, with the steps and the test of optimistix. The first
     turn makes the `moves` if they are right; `first` steps were taken before."""
     for steps in itertools.count(first + 1):
-        travelled = None if moves is None else travel(map, x * map.sizes, moves)
+        travelled = None
+        if moves is not None:
+            travelled = travel(map, x * map.sizes, moves)
         turn, step = _step_from(map, x, travelled)
         x = x + step
         # (Gaps between moves may be as large as errors of steps.)

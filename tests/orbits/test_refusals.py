@@ -83,8 +83,7 @@ def test_a_cycle_that_closes_sooner_is_none_of_two_periods_in_programs_either():
     system = Toys(make, [3.2])
     guess = hj.Guess("a", (0.8,))
     cycle = hj.find_limit_cycle(system, guess, multiplicity=2)
-    program = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
-    result = program
+    result = jax.jit(lambda r: hj.find_limit_cycle(Toys(make, r), cycle).result)
     measured = [result(np.array([r])) for r in (3.3, 2.8)]
     assert measured == [
         hj.errors.Result.OK,
