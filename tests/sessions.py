@@ -56,7 +56,9 @@ def same_output(shown: str, printed: str) -> bool:
     # (A process that has searched for long has compiled the search, which takes other steps.)
     shown = STEPS.sub("after some Newton steps", shown)
     printed = STEPS.sub("after some Newton steps", printed)
-    if NUMBER.sub("#", shown).split() != NUMBER.sub("#", printed).split():
+    words = NUMBER.sub("#", shown).split()
+    expected = NUMBER.sub("#", printed).split()
+    if words != expected:
         return False
     numbers = zip(NUMBER.findall(shown), NUMBER.findall(printed), strict=True)
     return all(same_number(a, b) for a, b in numbers)

@@ -43,7 +43,8 @@ def results(tmp_path_factory):
 def test_reproduce_writes_its_results(results):
     summary = json.loads((results / "summary.json").read_text())
     assert summary["limit_cycle"]["period"] == pytest.approx(1.0)
-    multipliers = np.array(summary["limit_cycle"]["multipliers"]) @ [1, 1j]
+    pairs = np.array(summary["limit_cycle"]["multipliers"])
+    multipliers = pairs @ [1, 1j]
     assert multipliers == pytest.approx(
         [
             -0.248983334735609 + 0.699333251798004j,
@@ -59,13 +60,15 @@ def test_reproduce_writes_its_results(results):
         exact, estimate = (
             hj.load(results / f"{x}_{family}.npz") for x in ("exact", "estimate")
         )
-        assert exact.harmonics == estimate.harmonics == tuple(range(-16, 16))
+        every_harmonic = tuple(range(-16, 16))
+        assert exact.harmonics == estimate.harmonics == every_harmonic
         model, fit = (
             hj.load(results / f"{x}_{family}.npz") for x in ("ldtp", "structured")
         )
         assert_allclose(model.htf(exact.frequencies).H, exact.H, atol=1e-12)
         assert fit.compare(model.multipliers).max_error < 5e-3
-        assert hj.load(results / f"rational_{family}.npz").multipliers.shape == (2, 2)
+        stored = hj.load(results / f"rational_{family}.npz")
+        assert stored.multipliers.shape == (2, 2)
 
 
 def test_bad_input_is_one_sentence():
@@ -146,7 +149,8 @@ def protocols(monkeypatch):
 
 def test_the_short_form_has_other_sizes_and_failures_are_said(protocols, capsys):
     for options, sizes in {"": (80, 84, 64), "--quick": (20, 36, 16)}.items():
-        assert main(["reproduce", "--out", "x", *options.split()]) == 0
+        arguments = ["reproduce", "--out", "x", *options.split()]
+        assert main(arguments) == 0
         protocol = protocols.pop()
         assert (protocol.experiments, protocol.cycles, protocol.keep) == sizes
     assert main(["reproduce", "--out", "x", "--seed", "1"]) == 1

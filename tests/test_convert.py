@@ -50,7 +50,9 @@ def test_the_lifted_system_is_the_periodic_one(model):
         return np.exp(2j * np.pi * np.outer(f, np.arange(N)) / N)
 
     for m in H.harmonics:
-        found = np.einsum("fnyru,fn,fr->fyu", G, wave(-(f + m)), wave(f)) / N
+        back = wave(-(f + m))
+        turns = wave(f)
+        found = np.einsum("fnyru,fn,fr->fyu", G, back, turns) / N
         assert_allclose(found, H[m], rtol=0, atol=1e-12)
 
 
@@ -59,7 +61,8 @@ def test_scipy(model):
     lti = convert.to_lti(model)
     assert system.dt == 2.0
     for name in "ABCD":
-        assert_array_equal(getattr(system, name), getattr(lti, name)[0])
+        of_lti = getattr(lti, name)[0]
+        assert_array_equal(getattr(system, name), of_lti)
 
 
 def test_python_control_gets_the_lifted_system(model):
@@ -68,7 +71,8 @@ def test_python_control_gets_the_lifted_system(model):
     assert system.dt == 2.0
     assert system.input_labels[2] == "u[1]"
     f = np.linspace(0.01, 0.49, 7)
-    response = system(np.exp(2j * np.pi * f))
+    points = np.exp(2j * np.pi * f)
+    response = system(points)
     expected = convert.to_lti(model).htf(f).H[0]
     assert_allclose(np.moveaxis(response, 2, 0), expected, rtol=0, atol=1e-12)
 
@@ -80,19 +84,25 @@ def test_python_control_gets_frequency_responses(model):
     data = convert.to_control(H, period=2.0)
     assert isinstance(data, control.FrequencyResponseData)
     assert data.output_labels == ["y[-2]", "y[-1]", "y[0]", "y[1]", "y[2]"]
-    assert_allclose(data.omega, 2 * np.pi * f / 2.0)
+    omega = 2 * np.pi * f / 2.0
+    assert_allclose(data.omega, omega)
     of_harmonic = data(1j * data.omega)
-    assert_array_equal(of_harmonic[1], np.asarray(H[-1])[:, 0].T)
+    last_harmonic = np.asarray(H[-1])
+    response = last_harmonic[:, 0]
+    assert_array_equal(of_harmonic[1], response.T)
 
     one = convert.to_control(H.select([0]))[0, 0]
     drawn = control.bode_plot(one).lines[0, 0][0]
-    assert_allclose(drawn.get_ydata(), np.abs(H[0][:, 0, 0]))
+    H_0 = H[0][:, 0, 0]
+    modulus = np.abs(H_0)
+    assert_allclose(drawn.get_ydata(), modulus)
 
 
 def recording():
     """Two trials of two signals, one of them with a missing sample."""
     t = np.arange(5) / 10
-    signals = {"a": t, "b": np.where(t == 0.2, np.nan, t**2)}
+    with_gap = np.where(t == 0.2, np.nan, t**2)
+    signals = {"a": t, "b": with_gap}
     events = {"e": [0.1, 0.3], "never": []}
     trials = []
     for name in ("first", "second"):
@@ -106,10 +116,17 @@ def test_a_dataset_of_an_htf_can_be_cut_and_read_back(model):
     pytest.importorskip("xarray")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     dataset = convert.to_xarray(H)
-    one = dataset.H.sel(frequency=0.4, harmonic=-1, input="w", output="y")
-    assert one.item() == complex(H[-1][-1, 0, 1])
+    one = dataset.H.sel(
+        frequency=0.4,
+        harmonic=-1,
+        input="w",
+        output="y",
+    )
+    expected = complex(H[-1][-1, 0, 1])
+    assert one.item() == expected
     assert dataset.input_unit.sel(input="u").item() == "N"
-    part = dataset.isel(harmonic=[1, 2], input=[0]).sel(frequency=slice(0, 0.2))
+    cut = dataset.isel(harmonic=[1, 2], input=[0])
+    part = cut.sel(frequency=slice(0, 0.2))
     fewer = convert.from_xarray(part)
     assert fewer.harmonics == (-1, 0)
     assert fewer.inputs == ("u",)
@@ -122,7 +139,8 @@ def test_a_dataset_of_a_recording_knows_units_and_events():
     assert dataset.a.attrs["units"] == "N"
     assert "units" not in dataset.b.attrs
     second = dataset.isel(sample=dataset.trial.values == 1)
-    assert_array_equal(second.b, recording().trials[1].values[:, 1])
+    values = recording().trials[1].values
+    assert_array_equal(second.b, values[:, 1])
     times = dataset.event_time[dataset.event == "e"]
     assert times.values.tolist() == [0.1, 0.3, 0.1, 0.3]
 
@@ -145,7 +163,8 @@ def test_a_dataset_of_a_model_has_named_dimensions(model):
 def test_a_dataset_of_experiments_begins_at_section_0():
     pytest.importorskip("xarray")
     u = np.zeros((2, 4 * N, 2))
-    y = u + np.arange(4 * N)[:, None]
+    drift = np.arange(4 * N)[:, None]
+    y = u + drift
     data = hj.experiments.ExperimentData(u, y, n_sections=N, periods=2)
     dataset = convert.to_xarray(data)
     second_period = convert.from_xarray(dataset.isel(sample=slice(N, None)))
@@ -167,7 +186,8 @@ def test_section_data(wave):
         wave, crossing, inputs="f", outputs="x", n_sections=8
     )
     dataset = convert.to_xarray(data)
-    assert_array_equal(dataset.x.values, data.records[0].y[:, 0])
+    values_of_x = data.records[0].y[:, 0]
+    assert_array_equal(dataset.x.values, values_of_x)
     average = dataset.average_cycle.sel(signal="x")
     assert_array_equal(average.values, data.cycle_outputs[:, 0])
     with pytest.raises(hj.errors.DefinitionError, match="that `to_xarray` made of a"):
@@ -185,16 +205,19 @@ def test_a_table_of_a_recording_is_read_back():
     frame = recording().to_pandas()
     first = frame[frame["trial"] == 0].drop(columns="trial")
     again = hj.Recording.from_frame(first, units={"a": "N"})
-    assert_array_equal(again.trials[0].values, recording().trials[0].values)
+    values = again.trials[0].values
+    assert_array_equal(values, recording().trials[0].values)
 
 
 def test_a_table_of_an_htf_has_a_row_for_each_value(model):
     pytest.importorskip("pandas")
     H = model.htf(np.linspace(0.01, 0.4, 5))
     table = H.to_pandas()
-    row = table.loc[-1, H.frequencies[1].item(), "y", "w"]
+    frequency = H.frequencies[1].item()
+    row = table.loc[-1, frequency, "y", "w"]
     value = complex(H[-1][1, 0, 1])
-    assert tuple(row) == (value.real, value.imag, np.abs(value))
+    expected = (value.real, value.imag, np.abs(value))
+    assert tuple(row) == expected
     assert np.asarray(H).tobytes() == H.H.tobytes()
 
 

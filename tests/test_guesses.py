@@ -40,12 +40,19 @@ def names():
     data = hj.experiments.add_noise(clean, std=1e-5)
     est = hj.estimate_htf(data, harmonics=(-1, 0, 1))
     whole = hj.estimate_htf(data)
-    force = np.random.default_rng(0).normal(size=(1, 3000, 1))
+    rng = np.random.default_rng(0)
+    force = rng.normal(size=(1, 3000, 1))
     made = hj.testing.simulate_recording(cycle, 0.01 * force, OUTPUTS, rate=50)
     known = dict(
         hj=hj, np=np, hopper=hopper, cycle=cycle, apex=APEX, est=est, data=data
     )
-    known |= dict(sections=sections, model=model, design=design, whole=whole, rec=made)
+    known |= dict(
+        sections=sections,
+        model=model,
+        design=design,
+        whole=whole,
+        rec=made,
+    )
     known |= dict(
         fit=hj.fit_multipliers(est, order=2),
         ser=hj.fit_series(data, order=2),
@@ -408,7 +415,8 @@ def test_tables_of_words_have_owners_that_exist():
     for owners in ATTRIBUTES:
         assert set(owners.split()) <= classes
     for owners in KEYWORDS:
-        assert set(owners.split()) <= {*PLACES, *hj.__all__}
+        known = {*PLACES, *hj.__all__}
+        assert set(owners.split()) <= known
     for namespace in NAMES:
         assert namespace == "" or namespace in hj.__all__
 
@@ -530,7 +538,8 @@ def test_an_error_in_a_field_has_the_hint_that_fits():
 
     misspelt = error_of(lambda t, q, u, p: -p.dampin * q[0])
     assert misspelt.endswith("A System has no `dampin`: use `damping`.")
-    assert "write `p.k`" in error_of(lambda t, q, u, p: -p["damping"] * q[0])
+    error = error_of(lambda t, q, u, p: -p["damping"] * q[0])
+    assert "write `p.k`" in error
     assert "write `y, v = q`" in error_of(lambda t, q, u, p: -q["x"])
     assert "q and u are arrays" in error_of(lambda t, q, u, p: -q + [1.0])
     assert "from_functions` take (t, q, u, p)" in error_of(lambda t, q, p: -q)
@@ -611,7 +620,8 @@ def test_every_fit_does_what_fits_do(names, name):
     low, high = fit.interval(0.9).T
     assert_allclose((low + high) / 2, values)
     assert (high - low > 3 * errors).all()
-    assert np.all(fit.contains(names["cycle"], level=1 - 1e-9))
+    is_inside = fit.contains(names["cycle"], level=1 - 1e-9)
+    assert np.all(is_inside)
     assert fit.compare(names["cycle"]).p_value > 1e-9
     assert "p " in repr(fit.compare(names["cycle"]))
     assert "true" in repr(fit.compare(names["cycle"]))
@@ -619,7 +629,8 @@ def test_every_fit_does_what_fits_do(names, name):
     assert fit.compare(fit).p_value > 0.99
     assert len(fit.to_pandas()) == len(values)
     assert fit.plot().axes.size
-    assert hj.validate(fit, names["data"]).fit.min() > 90
+    validation = hj.validate(fit, names["data"])
+    assert validation.fit.min() > 90
 
 
 @pytest.mark.parametrize("name", FITS)
@@ -636,8 +647,10 @@ def test_every_fit_comes_back_from_a_file(names, name):
         assert other.to_pandas().equals(fit.to_pandas())
     if name == "ldtp":
         f = np.array([0.1, 0.7])
-        assert_array_equal(back.htf(f).H, fit.htf(f).H)
-        assert_array_equal(back.htf(f).variance, fit.htf(f).variance)
+        stored = back.htf(f).H
+        assert_array_equal(stored, fit.htf(f).H)
+        variance = back.htf(f).variance
+        assert_array_equal(variance, fit.htf(f).variance)
     if name == "phys":
         assert type(back).__name__ == "ParameterEstimate"
         assert back.names == ("k", "b")
@@ -651,15 +664,19 @@ def test_p_values_are_those_of_the_coefficients(names):
     fit = names["fit"]
     other = names["ser"]
     true = names["cycle"].multipliers
-    missed = fit.coefficients - np.poly(true).real[1:]
+    exact = np.poly(true).real[1:]
+    missed = fit.coefficients - exact
     distance = missed @ np.linalg.solve(fit.covariance, missed)
     dof = fit.covariance_dof
-    expected = stats.f.sf(distance * (dof - 1) / (2 * dof), 2, dof - 1)
+    ratio = distance * (dof - 1) / (2 * dof)
+    expected = stats.f.sf(ratio, 2, dof - 1)
     assert_allclose(fit.compare(true).p_value, expected, rtol=1e-6)
     missed = fit.coefficients - other.coefficients
-    distance = missed @ np.linalg.solve(fit.covariance + other.covariance, missed)
+    covariance = fit.covariance + other.covariance
+    distance = missed @ np.linalg.solve(covariance, missed)
     dof = min(dof, other.covariance_dof)
-    expected = stats.f.sf(distance * (dof - 1) / (2 * dof), 2, dof - 1)
+    ratio = distance * (dof - 1) / (2 * dof)
+    expected = stats.f.sf(ratio, 2, dof - 1)
     assert_allclose(fit.compare(other).p_value, expected, rtol=1e-6)
 
 
@@ -680,23 +697,29 @@ def test_a_fit_of_some_harmonics_says_so_where_it_is_validated(names):
     data = names["data"]
     some = hj.validate(names["fit"], data)
     assert [x.cause for x in some.findings] == ["harmonics"]
-    whole = hj.validate(hj.fit_multipliers(names["whole"], order=2), data)
+    fit = hj.fit_multipliers(names["whole"], order=2)
+    whole = hj.validate(fit, data)
     assert not whole.findings
     assert whole.independent
     # As the fit to the series explains the same data.
-    assert_allclose(whole.fit, hj.validate(names["ser"], data).fit, atol=0.3)
+    expected = hj.validate(names["ser"], data).fit
+    assert_allclose(whole.fit, expected, atol=0.3)
 
 
 def test_tables_hold_the_numbers(names):
     data = names["data"]
     table = data.to_pandas()
-    row = table[(table.experiment == 3) & (table.cycle == 5) & (table.section == 2)]
-    assert row.vM.item() == data.y[3, 42, 1]
-    assert_array_equal(data["u"], data.u[:, :, 0])
+    of_cycle = (table.experiment == 3) & (table.cycle == 5)
+    row = table[of_cycle & (table.section == 2)]
+    expected = data.y[3, 42, 1]
+    assert row.vM.item() == expected
+    inputs = data.u[:, :, 0]
+    assert_array_equal(data["u"], inputs)
     states = names["traj"].to_pandas()
     assert set(states.chart) == {"flight", "stance"}
     assert states[states.chart == "stance"].ym.isna().all()
-    assert_allclose(states.yM.iloc[-1], names["traj"].after[-1, 0])
+    end = names["traj"].after[-1, 0]
+    assert_allclose(states.yM.iloc[-1], end)
     one = names["cycle"].to_pandas()
     assert one.k.item() == 10.0
     assert_allclose(one["multipliers.0.modulus"], names["cycle"].modulus[0])
@@ -720,7 +743,8 @@ def test_a_system_from_functions_is_that_of_a_class():
         {"g": 9.81, "A": 0.15, "e": 0.7},
         period=1.0,
     )
-    cycle = hj.find_limit_cycle(juggler, hj.Guess("main", (0.2, 4.5), time=0.1))
+    guess = hj.Guess("main", (0.2, 4.5), time=0.1)
+    cycle = hj.find_limit_cycle(juggler, guess)
     *_, exact = hj.models.PaddleJuggler().exact()
     assert_allclose(cycle.multipliers, exact, atol=1e-12)
 
@@ -733,7 +757,9 @@ def test_a_system_from_functions_is_that_of_a_class():
         *_, multipliers = hj.models.PaddleJuggler(restitution=e).exact()
         return -jnp.sum(multipliers).real
 
-    assert_allclose(jax.grad(trace)(0.7), jax.grad(exact_trace)(0.7), rtol=1e-8)
+    slope = jax.grad(trace)(0.7)
+    exact_slope = jax.grad(exact_trace)(0.7)
+    assert_allclose(slope, exact_slope, rtol=1e-8)
     with pytest.raises(hj.errors.DefinitionError, match="another attribute 'inputs'"):
         hj.HybridSystem.from_functions("x", lambda t, q, u, p: -q, (), {"inputs": 1.0})
 
@@ -750,8 +776,10 @@ def test_a_result_of_several_steps_compares_as_its_fit(names):
     """Not as a truth without errors."""
     fit = names["fit"]
     result = names["result"]
-    assert fit.compare(result).p_value == fit.compare(result.fit).p_value
-    assert fit.compare(result).p_value > fit.compare(result.multipliers).p_value
+    by_result = fit.compare(result).p_value
+    assert by_result == fit.compare(result.fit).p_value
+    by_multipliers = fit.compare(result.multipliers).p_value
+    assert fit.compare(result).p_value > by_multipliers
     assert "other fit" in repr(fit.compare(result))
 
 

@@ -51,7 +51,8 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def ldtp():
     rng = np.random.default_rng(0)
-    A = [rng.normal(size=s) / 4 for s in ((3, 2), (2, 3))]
+    shapes = ((3, 2), (2, 3))
+    A = [rng.normal(size=s) / 4 for s in shapes]
     B = [rng.normal(size=(3, 2)), rng.normal(size=(2, 2))]
     C = [np.ones((1, 2)), np.ones((1, 3))]
     names = (("x", "v"), ("x", "v", "z"))
@@ -102,7 +103,8 @@ def test_every_kind_comes_back_bit_by_bit(folder, things, htf):
     backs = [trip(folder, thing) for thing in things]
     assert all(map(same, things, backs))
     assert type(backs[-1].periods) is int
-    assert backs[-1].summary() == things[-1].summary()
+    summary = things[-1].summary()
+    assert backs[-1].summary() == summary
     assert {p.name for p in folder.iterdir()} == {"thing.npz"}
     xarray = pytest.importorskip("xarray")
     for thing in things:
@@ -129,29 +131,34 @@ def test_round_trip_of_any_htf(folder, data):
     finite = st.complex_numbers(
         allow_nan=False, allow_infinity=False, max_magnitude=1e300
     )
-    H = data.draw(arrays(complex, (len(harmonics), F, ny, nu), elements=finite))
+    shape = (len(harmonics), F, ny, nu)
+    H = data.draw(arrays(complex, shape, elements=finite))
     numbers = st.floats(-1e300, 1e300)
     f = data.draw(
         st.lists(numbers, min_size=F, max_size=F, unique_by=lambda x: round(x, 6))
     )
     words = st.text().map("y".__add__)  # (no input's name)
     names = data.draw(st.lists(words, min_size=ny, max_size=ny, unique=True))
-    htf = hj.linear.HTF(f, H, harmonics, 7, None, names, data.draw(st.text()))
+    method = data.draw(st.text())
+    htf = hj.linear.HTF(f, H, harmonics, 7, None, names, method)
     assert same(htf, trip(folder, htf))
 
 
 @settings(max_examples=50)
 @given(st.data())
 def test_damaged_files_are_refused_or_harmless(folder, things, data):
-    thing = things[data.draw(st.integers(0, len(things) - 1))]
+    place = data.draw(st.integers(0, len(things) - 1))
+    thing = things[place]
     path = folder / "damaged.npz"
     hj.save(path, thing)
     content = bytearray(path.read_bytes())
     if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content) - 1))]
+        end = data.draw(st.integers(0, len(content) - 1))
+        content = content[:end]
     else:
         # Half of the flips in the archive's directory at the end, where checksums do not reach.
-        low = data.draw(st.sampled_from([0, max(0, len(content) - 700)]))
+        late = max(0, len(content) - 700)
+        low = data.draw(st.sampled_from([0, late]))
         for k in data.draw(
             st.lists(st.integers(low, len(content) - 1), min_size=1, max_size=3)
         ):
@@ -175,7 +182,9 @@ def rewrite(path, header=None, arrays=None):
     old = json.loads(str(content.pop("header")))
     content.update(arrays or {})
     old["arrays"].update({name: "" for name in arrays or {}})
-    np.savez(path, header=np.array(json.dumps({**old, **(header or {})})), **content)
+    merged = {**old, **(header or {})}
+    header_text = json.dumps(merged)
+    np.savez(path, header=np.array(header_text), **content)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +214,8 @@ def test_foreign_content(folder, things, change, says):
 def test_pickles_are_not_executed(folder, things):
     path = folder / "trap.npz"
     hj.save(path, things[2])
-    rewrite(path, arrays={"H": np.array([_Trap()], dtype=object)})
+    trap = np.array([_Trap()], dtype=object)
+    rewrite(path, arrays={"H": trap})
     with pytest.raises(hj.errors.FileFormatError, match="damaged"):
         hj.load(path)
     path.write_bytes(pickle.dumps(_Trap()))
@@ -221,7 +231,8 @@ def test_a_matlab_file(folder, ldtp, htf):
             value = operator.attrgetter(name)(thing)
             written = read[name.replace(".", "_")]
             assert_array_equal(written.squeeze(), np.squeeze(value))
-        assert json.loads(read["header"].item())["kind"] == type(thing).__name__
+        stored = json.loads(read["header"].item())
+        assert stored["kind"] == type(thing).__name__
 
 
 def test_where_nothing_can_be_written_or_read(folder, things):
@@ -239,7 +250,8 @@ def test_where_nothing_can_be_written_or_read(folder, things):
     ):
         with pytest.raises(hj.errors.HybridJaxError, match=problem):
             hj.load(folder / f"{name}.npz")
-    assert not [p for p in folder.iterdir() if p.name.startswith(".")]
+    hidden = [p for p in folder.iterdir() if p.name.startswith(".")]
+    assert not hidden
 
 
 def test_traced_and_batched_objects(folder, ldtp):
@@ -249,7 +261,8 @@ def test_traced_and_batched_objects(folder, ldtp):
 
     with pytest.raises(hj.errors.DefinitionError, match="outside of jit"):
         jax.jit(inside)(np.zeros(1))
-    batch = jax.vmap(lambda f: ldtp.htf(f))(np.linspace(0.1, 0.4, 4).reshape(2, 2))
+    frequencies = np.linspace(0.1, 0.4, 4).reshape(2, 2)
+    batch = jax.vmap(lambda f: ldtp.htf(f))(frequencies)
     with pytest.raises(
         hj.errors.DefinitionError, match="cannot be saved: its frequencies is float64"
     ):

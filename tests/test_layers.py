@@ -30,7 +30,8 @@ def imported(file):
         if isinstance(node, ast.ImportFrom):
             module = tuple(node.module.split(".")) if node.module else ()
             if node.level:
-                module = package[: len(package) - (node.level - 1)] + module
+                up = node.level - 1
+                module = package[: len(package) - up] + module
             elif module[:1] == ("hybridjax",):
                 module = module[1:]
             else:
@@ -73,7 +74,8 @@ def test_folders(folder):
             for path in imported(file)
             if path[:depth] == where and path[depth:]
         }
-        needs.setdefault(own, set()).update(others - {own})
+        new = others - {own}
+        needs.setdefault(own, set()).update(new)
     tuple(graphlib.TopologicalSorter(needs).static_order())
     modules = {f.stem for f in folder.iterdir() if f.suffix == ".py" or f.is_dir()}
     stub = folder / "__init__.pyi"

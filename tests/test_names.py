@@ -71,7 +71,8 @@ def test_each_name_has_one_place():
     places = [
         x.rpartition(".")[2] for x, _ in all_members() if not x.startswith("hj.plot.")
     ]
-    assert [name for name, count in Counter(places).items() if count > 1] == []
+    repeated = [name for name, count in Counter(places).items() if count > 1]
+    assert repeated == []
 
 
 def test_no_class_has_the_name_of_another():
@@ -83,7 +84,8 @@ def test_no_class_has_the_name_of_another():
     classes = {
         x.rpartition(".")[2] for x, thing in all_members() if isinstance(thing, type)
     }
-    assert {name for name in classes if named[name] > 1} == set()
+    repeated = {name for name in classes if named[name] > 1}
+    assert repeated == set()
 
 
 def test_types_that_functions_return_can_be_imported():
@@ -123,7 +125,8 @@ def test_one_thing_has_one_word():
             words |= {(name, x) for x in vars(thing) if not x.startswith("_")}
             words |= {(name, x) for x in getattr(thing, "__annotations__", {})}
     models = {(name, word) for name, word in words if name.startswith("hj.models.")}
-    assert {(name, word) for name, word in words - models if word in ONE_WORD} == set()
+    others = {(name, word) for name, word in words - models if word in ONE_WORD}
+    assert others == set()
 
 
 # Words that are no nouns, and say where or which.

@@ -32,13 +32,15 @@ def test_every_source_was_executed():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_executed_notebook_has_the_code_of_its_source(name):
-    notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text())
+    text = (NOTEBOOKS / f"{name}.ipynb").read_text()
+    notebook = json.loads(text)
     code = [
         "".join(c["source"]).strip()
         for c in notebook["cells"]
         if c["cell_type"] == "code"
     ]
-    assert code == cells((NOTEBOOKS / f"{name}.py").read_text())
+    script = (NOTEBOOKS / f"{name}.py").read_text()
+    assert code == cells(script)
     printed = json.dumps([c.get("outputs") for c in notebook["cells"]])
     assert "Traceback" not in printed
     assert "Warning" not in printed
@@ -70,8 +72,10 @@ def own_system(found):
 def fit(found):
     assert found.fit.identifiability.rank == 5
     assert found.fit.contains(found.truth, 0.999)
-    error = np.abs(found.found.multipliers - found.real.multipliers).max()
-    before = np.abs(found.guess.multipliers - found.real.multipliers).max()
+    difference = found.found.multipliers - found.real.multipliers
+    error = np.abs(difference).max()
+    difference_before = found.guess.multipliers - found.real.multipliers
+    before = np.abs(difference_before).max()
     assert error < 2e-3 < before
 
 
@@ -81,7 +85,8 @@ def play(found):
 
 
 def sweep(found):
-    error = abs(np.abs(found.best.multipliers).max() - found.winner[2])
+    largest = np.abs(found.best.multipliers).max()
+    error = abs(largest - found.winner[2])
     assert error < 1e-3
 
 
@@ -91,12 +96,15 @@ def recording(found):
 
 def neurons(found):
     assert found.found.left_out > found.found.left_out_flat + 0.02
-    assert np.mean((found.low <= found.true) & (found.true <= found.high)) > 0.7
+    above = found.low <= found.true
+    below = found.true <= found.high
+    assert np.mean(above & below) > 0.7
 
 
 def responses(found):
     # The regulator follows slow changes of its reference.
-    error = abs(abs(found.htf[0][0, 0, 0]) - 1)
+    modulus = abs(found.htf[0][0, 0, 0])
+    error = abs(modulus - 1)
     assert error < 0.05
 
 
@@ -114,7 +122,9 @@ def walking(found):
 def population(found):
     low = found.test["low"][0]
     high = found.test["high"][0]
-    assert low < np.mean(found.true[6:]) - np.mean(found.true[:6]) < high < 0
+    second = np.mean(found.true[6:])
+    difference = second - np.mean(found.true[:6])
+    assert low < difference < high < 0
 
 
 def in_the_loop(found):
@@ -129,7 +139,8 @@ def in_the_loop(found):
 
 
 def simulator(found):
-    assert found.fit.contains(found.returns.multipliers[:2]).all()
+    leading = found.returns.multipliers[:2]
+    assert found.fit.contains(leading).all()
 
 
 @pytest.mark.slow

@@ -52,7 +52,8 @@ def test_systems_print_values_with_units(name):
     assert head == name
     assert len(lines) <= 16
     for field, line in zip(own_fields(system), lines, strict=True):
-        number = f"{float(getattr(system, field.name)):.6g} {field.metadata['unit']}".rstrip()
+        value = float(getattr(system, field.name))
+        number = f"{value:.6g} {field.metadata['unit']}".rstrip()
         assert line.split() == [
             field.name,
             *number.split(),
@@ -80,7 +81,8 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
             hj.orbits.Settings(rtol=k),
             hj.ClockPhase(8, anchor=k),
         )
-        printed.extend(map(repr, (*written, hj.Guess("stance", (k, 0.0), k))))
+        guess = hj.Guess("stance", (k, 0.0), k)
+        printed.extend(map(repr, (*written, guess)))
         for thing in (
             hopper_cycle,
             placed_kinematic,
@@ -94,7 +96,8 @@ def test_under_transformations(hopper_cycle, placed_kinematic, kinematic_ldtp):
         return k
 
     look(jnp.ones(()))
-    assert all("traced float64[" in text for text in printed)
+    for text in printed:
+        assert "traced float64[" in text
     assert pages == [None] * 4
 
 
@@ -108,9 +111,12 @@ def test_definitions_print_as_they_are_written():
         "Scheduled(period=2, offset=0.5)",
     ]
     for text in written:
-        place = place_of(text.partition("(")[0]).rpartition(".")[0]
-        assert repr(eval(f"{place}.{text}")) == text
-    network = eqx.nn.MLP(2, 1, 8, 1, key=jax.random.key(0))
+        name = text.partition("(")[0]
+        place = place_of(name).rpartition(".")[0]
+        made = eval(f"{place}.{text}")
+        assert repr(made) == text
+    key = jax.random.key(0)
+    network = eqx.nn.MLP(2, 1, 8, 1, key=key)
 
     class Learned(hj.models.VerticalHopper):
         term: eqx.nn.MLP = None
@@ -161,13 +167,15 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     model = hj.linear.LDTP(
         m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM")
     )
-    point = BranchPoint("flip", 1, 2.0, np.array([-1.0 + 0j, 0.5]))
+    multipliers = np.array([-1.0 + 0j, 0.5])
+    point = BranchPoint("flip", 1, 2.0, multipliers)
     branch = Branch(
         "k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end)
     )
     t = np.linspace(0.0, 20.0, 2001)
     tt, *values = hopper_cycle.trajectory()("yM", "vM")
-    y, v = (np.interp(t, tt, x, period=1.0) * (1 + 1e-6 * np.sin(t)) for x in values)
+    wobble = 1 + 1e-6 * np.sin(t)
+    y, v = (np.interp(t, tt, x, period=1.0) * wobble for x in values)
     signals = {"<u>": np.cos(3 * t), "yM & co": y, "vM": v}
     events = {"<hit>": [1.0]}
     recording = hj.Recording(t, signals, units={"vM": "m/s"}, events=events, name="<i>")
@@ -201,7 +209,8 @@ def test_fits_show_standard_errors():
     model = hj.linear.LDTP(A, B, C, inputs="<u>", outputs=("yM & co", "vM"))
     rng = np.random.default_rng(0)
     u = rng.normal(size=(600, 1))
-    y = np.asarray(model.simulate(u)) + 1e-2 * rng.normal(size=(600, 2))
+    response = np.asarray(model.simulate(u))
+    y = response + 1e-2 * rng.normal(size=(600, 2))
     record = hj.experiments.SectionSeries(
         u, y, n_sections=4, inputs=model.inputs, outputs=model.outputs
     )
@@ -212,7 +221,8 @@ def test_fits_show_standard_errors():
     assert re.findall(r"± (\S+?)[,;]", repr(fit)) == errors  # one meaning in both
     assert any(x.startswith("noise yM & co ") for x in page.texts)
     assert shown(hj.validate(fit, record)).pictures == 1
-    htf = model.htf(np.linspace(0.05, 1.9, 30), harmonics=(0,))
+    f = np.linspace(0.05, 1.9, 30)
+    htf = model.htf(f, harmonics=(0,))
     assert "yM & co: multipliers" in "".join(shown(hj.identify.fit_rational(htf)).texts)
 
 
@@ -227,10 +237,12 @@ def test_pictures_are_xml_whatever_is_drawn():
         picture([Curve(x, np.zeros(10)), Curve(x, x, points=True)], square=True),
         picture([]),
     ]
-    assert [p == "" for p in pictures] == [False, False, True, False, True, False, True]
+    empty = [p == "" for p in pictures]
+    assert empty == [False, False, True, False, True, False, True]
     for one in filter(None, pictures):
         ElementTree.fromstring(one)
-    labels = [t.text for t in ElementTree.fromstring(pictures[1]).findall(".//{*}text")]
+    drawing = ElementTree.fromstring(pictures[1])
+    labels = [t.text for t in drawing.findall(".//{*}text")]
     assert len(set(labels)) == len(labels) > 4  # numbers on an axis can be told apart
 
 
@@ -269,10 +281,10 @@ def test_values_without_errors_have_nine_digits():
 
 def test_prints_are_true():
     odd = hj.multisine(8, periods=16, lines="odd")
-    assert set(np.diff(odd.frequencies * 16).round().astype(int)) >= {2}
-    assert "in steps of 1/8" in repr(odd) and "in steps of 1/16" in repr(
-        hj.multisine(8, periods=16)
-    )
+    steps = np.diff(odd.frequencies * 16).round()
+    assert set(steps.astype(int)) >= {2}
+    assert "in steps of 1/8" in repr(odd)
+    assert "in steps of 1/16" in repr(hj.multisine(8, periods=16))
     alone = hj.experiments.Design.from_lines([[0.1]], 1.0, n_sections=8, periods=10)
     assert "steps" not in repr(alone)
     model = hj.linear.LDTP([[[0.5]]], [[[1.0]]], [[[1.0]]])

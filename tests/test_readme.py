@@ -31,7 +31,8 @@ def test_a_newcomer_meets_a_picture_and_code_first():
     lines = (ROOT / "README.md").read_text().splitlines()
     picture = next(n for n, line in enumerate(lines, 1) if line.startswith("!["))
     code = next(n for n, line in enumerate(lines, 1) if line.startswith("import "))
-    assert (picture <= 8, code <= 12, len(lines) <= 90) == (True, True, True)
+    found = (picture <= 8, code <= 12, len(lines) <= 90)
+    assert found == (True, True, True)
 
 
 def test_every_how_to_page_is_one_click_from_the_index():
@@ -64,7 +65,8 @@ def read_section(tmp_path_factory):
                 session.run(text)
             elif language == "bash":
                 command = text.replace("\\\n", "")
-                assert main(shlex.split(command)[1:]) in (None, 0)
+                arguments = shlex.split(command)[1:]
+                assert main(arguments) in (None, 0)
         return session.module
 
     with pytest.MonkeyPatch.context() as patch:
@@ -77,7 +79,8 @@ def read_section(tmp_path_factory):
 
 # (What they begin with takes as long as each, so one worker gets them.)
 def section(test):
-    return pytest.mark.slow(pytest.mark.long(pytest.mark.xdist_group("tour")(test)))
+    grouped = pytest.mark.xdist_group("tour")(test)
+    return pytest.mark.slow(pytest.mark.long(grouped))
 
 
 @section
@@ -98,15 +101,18 @@ def test_the_section_on_fits_finds_the_parameters(read_section):
 def test_the_section_on_recordings_finds_the_multipliers(read_section):
     made = read_section("From a recording")
     found = made.result.fit.compare(made.cycle.multipliers)
-    assert found.max_error < 1e-2 and Path("report/report.html").exists()
+    assert found.max_error < 1e-2
+    assert Path("report/report.html").exists()
 
 
 def test_links_lead_somewhere():
-    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+    documents = (ROOT / "docs").rglob("*.md")
+    pages = [*ROOT.glob("*.md"), *documents]
     for page in pages:
         for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
             if "://" not in link:
-                assert (page.parent / link).exists(), f"{page.name} links to {link}"
+                target = page.parent / link
+                assert target.exists(), f"{page.name} links to {link}"
 
 
 def test_files_that_documents_name_are_there():
@@ -114,7 +120,8 @@ def test_files_that_documents_name_are_there():
         if page.name != "CHANGELOG.md":
             for name in re.findall(r"`(\w+/[\w/]+\.py)\b", page.read_text()):
                 places = ROOT / name, ROOT / "hybridjax" / name
-                assert any(place.exists() for place in places), f"{page.name}: {name}"
+                is_there = any(place.exists() for place in places)
+                assert is_there, f"{page.name}: {name}"
 
 
 def test_there_is_one_test_command_for_ci_to_find():
@@ -125,14 +132,16 @@ def test_there_is_one_test_command_for_ci_to_find():
     ]
     assert len(found) == 1
     script = ROOT / ".ci/run"
-    assert script.stat().st_mode & 0o100 and "README.md" in script.read_text()
+    assert script.stat().st_mode & 0o100
+    assert "README.md" in script.read_text()
 
 
 def test_claims_name_tests_that_exist():
     for path, name in re.findall(
         r"`(?:[^`]* )?(tests/\S+?\.py)(?:::(\w+))?`", CLAIMS.read_text()
     ):
-        assert f"def {name}" in (ROOT / path).read_text(), f"there is no {path}::{name}"
+        text = (ROOT / path).read_text()
+        assert f"def {name}" in text, f"there is no {path}::{name}"
 
 
 PAGES = ["docs/index.md", "docs/experiments.md"]

@@ -26,7 +26,8 @@ def test_all_files_have_the_same_version():
 
 
 def test_the_conda_recipe_requires_what_pyproject_does():
-    run = RECIPE.read_text().partition("  run:\n")[2].partition("\ntests:")[0]
+    section = RECIPE.read_text().partition("  run:\n")[2]
+    run = section.partition("\ntests:")[0]
     # The line of Python has blanks inside, so that it does not match.
     lines = re.findall(r"^    - (\S+) (\S+)$", run, re.MULTILINE)
     recipe = {NAMES_IN_CONDA.get(name, name): bounds for name, bounds in lines}
@@ -80,5 +81,6 @@ np.testing.assert_array_equal(jax.jit(lengths)(rows), np.arange(n) ** 2.0)
 
 def test_batched_products_followed_by_a_reduction():
     """jax issue 39103: on CPU, jax 0.10.2 silently returns 267911424 for the last of these."""
-    kept = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    variables = os.environ.items()
+    kept = {name: value for name, value in variables if name != "XLA_FLAGS"}
     run_python("-c", PRODUCTS, env=kept | {"JAX_ENABLE_X64": "1"})

@@ -33,7 +33,8 @@ def public_names() -> list[str]:
 
 
 def test_every_public_name_is_in_the_reference_once():
-    pages = "".join(page.read_text() for page in (ROOT / "docs/reference").glob("*.md"))
+    files = (ROOT / "docs/reference").glob("*.md")
+    pages = "".join(page.read_text() for page in files)
     assert Counter(re.findall(r"^::: (\S+)$", pages, re.MULTILINE)) == Counter(
         public_names()
     )
@@ -69,12 +70,16 @@ def test_users_call_or_construct_150_names_at_most():
 
 def test_every_public_name_that_a_user_writes_is_in_an_example():
     """Slow tests run the how-to pages and the README; notebooks run when they are built."""
-    pages = [ROOT / "README.md", *(ROOT / "docs/how-to").glob("*.md")]
+    guides = (ROOT / "docs/how-to").glob("*.md")
+    pages = [ROOT / "README.md", *guides]
     text = "".join(page.read_text() for page in pages)
     code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
-    code += "".join(page.read_text() for page in (ROOT / "notebooks").glob("*.py"))
-    written = {name.split(".")[-1] for name in public_names()} - GIVEN
-    assert not {name for name in written if not re.search(rf"\b{name}\b", code)}
+    files = (ROOT / "notebooks").glob("*.py")
+    code += "".join(page.read_text() for page in files)
+    last_parts = {name.split(".")[-1] for name in public_names()}
+    written = last_parts - GIVEN
+    missing = {name for name in written if not re.search(rf"\b{name}\b", code)}
+    assert not missing
 
 
 def test_citations_have_the_version_of_the_package():
@@ -115,7 +120,8 @@ def test_thumbnails_are_those_of_the_code_on_their_pages(monkeypatch):
         return np.array(re.findall(r"-?\d+(?:\.\d+)?", text), float)
 
     for name in ("compass-gait", "slip", "van-der-pol"):
-        file = values((pictures.IMAGES / f"gallery/{name}.svg").read_text())
+        drawing = (pictures.IMAGES / f"gallery/{name}.svg").read_text()
+        file = values(drawing)
         assert_allclose(
             values(pictures.thumbnail(*pictures.run(name))), file, atol=1.01
         )
@@ -127,7 +133,8 @@ def test_the_gallery_has_a_page_with_code_for_each_thumbnail(site):
         r'<a href="(gallery/[\w-]+\.html)"><svg', (site / "gallery.html").read_text()
     )
     assert len(set(pages)) == 29
-    assert all("find_limit_cycle" in (site / page).read_text() for page in pages)
+    for page in pages:
+        assert "find_limit_cycle" in (site / page).read_text()
 
 
 @pytest.mark.slow
@@ -157,7 +164,8 @@ def test_links_lead_somewhere(site):
             target = (page.parent / path).resolve() if path else page
             target = target / "index.html" if target.is_dir() else target
             assert target.exists(), (page, link)
-            assert anchor in known.get(target, {anchor}) | {""}, (page, link)
+            anchors = known.get(target, {anchor})
+            assert anchor in anchors | {""}, (page, link)
 
 
 @pytest.mark.slow
@@ -186,7 +194,8 @@ def test_notebooks_come_with_their_pictures(site):
         # or animations
         assert len(pictures) == text.count('"image/png"')
         assert "image/" in text
-        assert all((site / "notebooks" / name).exists() for name in pictures)
+        for name in pictures:
+            assert (site / "notebooks" / name).exists()
 
 
 @pytest.mark.slow
@@ -217,5 +226,6 @@ def test_animations_of_notebooks_run_in_a_browser(site, notebook, tmp_path):
         run = [browser, *options, profile, budget, "--dump-dom", page.as_uri()]
         shown = subprocess.run(run, capture_output=True, text=True, timeout=120).stdout
         now = pictures(shown)
-        moved |= {k for k in range(count) if now[k] != first[k]}
+        changed = {k for k in range(count) if now[k] != first[k]}
+        moved |= changed
     assert moved == set(range(count))

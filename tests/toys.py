@@ -56,7 +56,9 @@ def resting(t, q, u):
     """A driven oscillator, and beside it a state that only rounding errors move from zero."""
     (x, v, w) = q
     c = jnp.cos(3 * t)
-    return v, c - 4 * x - v + u[0], (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
+    v_rate = c - 4 * x - v + u[0]
+    w_rate = (1 + 0.1 * c) * 3 - 3 - 0.3 * c - w
+    return v, v_rate, w_rate
 
 
 RESTING = toy({"all": Field(("x", "v", "w"), resting)}, period=2 * np.pi / 3)
@@ -127,7 +129,8 @@ class Switched(hj.HybridSystem):
     def exact(self):
         """x at the time of switching on, on the cycle."""
         rest = jnp.exp(-(1 - self.duty))
-        return (rest - jnp.exp(-1.0)) / (1 - jnp.exp(-1.0))
+        left = jnp.exp(-1.0)
+        return (rest - left) / (1 - left)
 
 
 def many(cycle, n):

@@ -161,7 +161,8 @@ def solve(matrices: Array, right: Array) -> Array:
     """
     if on_host(matrices):
         return np.linalg.solve(matrices, right)
-    shape = (*matrices.shape[:-2], *right.shape[-2:])
+    columns = right.shape[-2:]
+    shape = (*matrices.shape[:-2], *columns)
     right = jnp.broadcast_to(right, shape)
     rows = [x.reshape(-1, *x.shape[-2:]) for x in (matrices, right)]
     solutions = jax.lax.map(lambda row: jnp.linalg.solve(*row), rows)

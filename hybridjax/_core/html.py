@@ -112,7 +112,9 @@ def unit_circle(
 ) -> str:
     """A picture of multipliers, with the borders of their confidence regions."""
     circle = np.exp(2j * np.pi * np.linspace(0, 1, _POINTS))
-    curves = [Curve(np.real(circle), np.imag(circle), color=COLORS[-1])]
+    real = np.real(circle)
+    imaginary = np.imag(circle)
+    curves = [Curve(real, imaginary, color=COLORS[-1])]
     for z in regions:
         x = np.real(z).clip(-3, 3)
         y = np.imag(z).clip(-3, 3)
@@ -169,7 +171,8 @@ def picture(
             axes.yaxis.set_major_formatter("{x:g}")
         for c, visible in zip(curves, shown, strict=True):
             n = len(visible)
-            k = np.linspace(0, n - 1, min(n, _POINTS)).round().astype(int)
+            places = np.linspace(0, n - 1, min(n, _POINTS))
+            k = places.round().astype(int)
             values = np.where(visible, c.y, np.nan)[k]
             line: dict[str, Any] = (
                 {"ls": "", "marker": "o", "ms": 3} if c.points else {"lw": 1}

@@ -283,7 +283,8 @@ class Reading:
             self._function_name = x.__qualname__
         self._visit_all(cells)
         if not is_installed:
-            self._visit({k: v for k, v in vars(x).items() if k != "__wrapped__"})
+            own = {k: v for k, v in vars(x).items() if k != "__wrapped__"}
+            self._visit(own)
 
     def _globals(self, x: types.FunctionType) -> None:
         """Visit what a function, and the functions written in it, read of their module."""
@@ -442,7 +443,8 @@ class Reading:
         if not is_own or function.__closure__:
             self.retraced = True
         self._visit(function)
-        self._visit({k: v for k, v in vars(x).items() if callable(v)})
+        callables = {k: v for k, v in vars(x).items() if callable(v)}
+        self._visit(callables)
 
     def _value(self, x: Any) -> None:
         """Visit the value of an object whose class is made of a type of Python or NumPy."""
@@ -545,7 +547,8 @@ def _listed(x: Any) -> Any:
 
 def _state_of(x: Any) -> dict[str, Any]:
     """The attributes of an object, in its dictionary and in slots."""
-    state = dict(sorted(getattr(x, "__dict__", {}).items(), key=lambda item: str(item)))
+    attributes = getattr(x, "__dict__", {})
+    state = dict(sorted(attributes.items(), key=lambda item: str(item)))
     state.pop("code_digest", None)
     for base in type(x).__mro__:
         slots = vars(base).get("__slots__", ())
@@ -578,7 +581,8 @@ def _is_option(cell: types.CellType) -> bool:
     except ValueError:
         return False
     kinds = (*_PLAIN, tuple, list, dict, set, frozenset, types.FunctionType)
-    return type(x) in kinds or isinstance(x, types.MethodType | _JITTED | ft.partial)
+    is_function = isinstance(x, types.MethodType | _JITTED | ft.partial)
+    return type(x) in kinds or is_function
 
 
 def _imported(name: str, level: int, space: dict[str, Any]) -> types.ModuleType | None:

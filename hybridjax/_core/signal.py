@@ -40,7 +40,10 @@ class Signal(str):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, str):
             return NotImplemented
-        return str.__eq__(self, other) and len({self.unit, unit_of(other)} - {""}) < 2
+        if not str.__eq__(self, other):
+            return False
+        units = {self.unit, unit_of(other)} - {""}
+        return len(units) < 2
 
     def __ne__(self, other: object) -> bool:
         return not self == other

@@ -176,7 +176,15 @@ def _add_identify(commands) -> None:
         "multipliers, harmonic transfer functions and impulse responses, with a report. Without "
         "inputs, to multipliers from variability.",
     )
-    add = identify.add_argument
+    _add_signals(identify.add_argument)
+    _add_phase(identify)
+    _add_estimate(identify.add_argument)
+    _add_results(identify)
+    identify.set_defaults(run=_identify, parser=identify)
+
+
+def _add_signals(add: Callable[..., Any]) -> None:
+    """Add the options about files and signals."""
     add(
         "files",
         nargs="*",
@@ -221,6 +229,10 @@ def _add_identify(commands) -> None:
         metavar="NAMES",
         help="measured outputs; by default the durations between the events of --event",
     )
+
+
+def _add_phase(identify) -> None:
+    """Add the options about the phase of the cycle."""
     phase = identify.add_mutually_exclusive_group(required=True)
     phase.add_argument(
         "--phase",
@@ -236,12 +248,16 @@ def _add_identify(commands) -> None:
     )
     phase.add_argument("--event", metavar="NAME", help="event at which a cycle begins")
     for name, kind in {"--center": _two_numbers, "--scale": _two_positive}.items():
-        add(
+        identify.add_argument(
             name,
             type=kind,
             metavar="X,V",
             help="of the angle of --phase; estimated by default",
         )
+
+
+def _add_estimate(add: Callable[..., Any]) -> None:
+    """Add the options about sections, sampling and the fit."""
     add(
         "--sections",
         type=_count,
@@ -279,8 +295,6 @@ def _add_identify(commands) -> None:
         metavar="CYCLES",
         help="remove changes of the cycle that take longer than this",
     )
-    _add_results(identify)
-    identify.set_defaults(run=_identify, parser=identify)
 
 
 def _add_sweep(commands) -> None:

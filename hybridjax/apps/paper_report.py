@@ -1,7 +1,7 @@
 """The report of `reproduce`: numbers, the paper's observations, a table."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -69,81 +69,103 @@ def summarize(protocol: Any, cycle: LimitCycle, families: Mapping[str, Any]) -> 
 
 def _observations(families: Mapping[str, Any]) -> list[dict]:
     """Return the paper's observations (Secs. VI-C1 to C3), each with the values measured here."""
-    from scipy.signal import find_peaks  # (half a second)
-
-    observations = []
-
-    def note(claim, holds, measured):
-        observations.append(
-            {"claim": claim, "holds": bool(holds), "measured": measured}
-        )
-
-    def top(family, m):
-        return np.abs(np.asarray(family.estimate[m])[:, :, 0]).max(axis=0)
-
-    iso = families["isochron"]
-    kin = families["kinematic"]
-    ratio = top(iso, 0) / top(kin, 0)
-    text = f"max|H_0| isochron / kinematic: {_pairs(ratio)}"
-    note(
-        "the gain of H_0 is doubled with isochrons",
-        np.all((ratio > 1.6) & (ratio < 2.5)),
-        text,
-    )
-    a = iso.rational
-    b = kin.rational
-    poles = np.sort_complex(a.poles)
-    moved = np.max(np.abs(poles - np.sort_complex(b.poles)), axis=1)
-    text = f"distance of the fitted poles in z: {_pairs(moved)}"
-    note(
-        "the choice of phase leaves the poles where they are",
-        np.all(moved < 1e-3),
-        text,
-    )
-    moved = np.max(np.abs(a.zeros - b.zeros), axis=1)
-    text = f"distance of the fitted zeros in z: {_pairs(moved)}"
-    note("the choice of phase moves the zeros", np.any(moved > 1e-2), text)
+    observations = [*_about_phases(families["isochron"], families["kinematic"])]
     for name, family in families.items():
-        f = np.asarray(family.exact.frequencies)
-        H_0 = np.asarray(family.exact[0])[:, :, 0]
-        size = np.log(np.abs(H_0))
-        peaks = [
-            f[find_peaks(size[:, k], prominence=0.01)[0]] for k in range(len(OUTPUTS))
+        observations += [
+            _about_bumps(name, family),
+            _about_higher_harmonics(name, family),
+            _about_fits(name, family),
         ]
-        peaks = [p[(p > 1.5) & (p < 2.5)] for p in peaks]
-        places = [", ".join(f"{x:.3g}" for x in p) or "none" for p in peaks]
-        places = [
-            f"{place} ({output})" for output, place in zip(OUTPUTS, places, strict=True)
-        ]
-        text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
-        note(f"{name}: bumps of H_0 around f = 2", any(map(len, peaks)), text)
-        H = np.asarray(family.estimate.H)[..., 0]
-        power = np.sum(np.abs(H) ** 2, axis=1)
-        order = np.abs(np.array(family.estimate.harmonics))
-        within = [power[order <= m].sum(axis=0) / power.sum(axis=0) for m in (1, 2)]
-        second = np.maximum(top(family, 2), top(family, -2))
-        second = second / top(family, 0)
-        text = (
-            f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of |H_m|^2 with "
-        )
-        text += f"|m| <= 1: {_pairs(within[0])}, with |m| <= 2: {_pairs(within[1])}"
-        note(f"{name}: |H_m| is negligible for |m| >= 2", np.all(second < 0.1), text)
-        close = [
-            family.rational.compare(family.ldtp.multipliers, k).max_error
-            for k in OUTPUTS
-        ]
-        text = f"{name}: eigenvalues from the fits are right up to the third significant digit"
-        note(text, max(close) < 5e-3, f"|error|: {_pairs(close)}")
     exact = next(iter(families.values())).ldtp.multipliers
     text = ", ".join(f"{z:.6f}" for z in exact)
     text += ": with the paper's parameters the real part is negative, the printed sign was lost"
     printed = 0.25 + np.array([0.7j, -0.7j])
-    note(
-        "the multipliers are 0.25 +- 0.70j",
-        np.all(np.abs(exact - printed) < 1e-2),
-        text,
-    )
+    holds = np.all(np.abs(exact - printed) < 1e-2)
+    observations.append(_noted("the multipliers are 0.25 +- 0.70j", holds, text))
     return observations
+
+
+def _noted(claim: str, holds: Any, measured: str) -> dict:
+    return {"claim": claim, "holds": bool(holds), "measured": measured}
+
+
+def _largest(family: Any, m: int) -> np.ndarray:
+    """Return the largest |H_m| of each output."""
+    modulus = np.abs(np.asarray(family.estimate[m])[:, :, 0])
+    return modulus.max(axis=0)
+
+
+def _about_phases(isochron: Any, kinematic: Any) -> Iterator[dict]:
+    """Compare the two choices of the phase."""
+    ratio = _largest(isochron, 0) / _largest(kinematic, 0)
+    yield _noted(
+        "the gain of H_0 is doubled with isochrons",
+        np.all((ratio > 1.6) & (ratio < 2.5)),
+        f"max|H_0| isochron / kinematic: {_pairs(ratio)}",
+    )
+    a = isochron.rational
+    b = kinematic.rational
+    apart = np.abs(np.sort_complex(a.poles) - np.sort_complex(b.poles))
+    moved = np.max(apart, axis=1)
+    yield _noted(
+        "the choice of phase leaves the poles where they are",
+        np.all(moved < 1e-3),
+        f"distance of the fitted poles in z: {_pairs(moved)}",
+    )
+    moved = np.max(np.abs(a.zeros - b.zeros), axis=1)
+    yield _noted(
+        "the choice of phase moves the zeros",
+        np.any(moved > 1e-2),
+        f"distance of the fitted zeros in z: {_pairs(moved)}",
+    )
+
+
+def _about_bumps(name: str, family: Any) -> dict:
+    """Look for local maxima of |H_0| around f = 2."""
+    from scipy.signal import find_peaks  # (half a second)
+
+    f = np.asarray(family.exact.frequencies)
+    H_0 = np.asarray(family.exact[0])[:, :, 0]
+    size = np.log(np.abs(H_0))
+    found = []
+    places = []
+    for k, output in enumerate(OUTPUTS):
+        maxima, _ = find_peaks(size[:, k], prominence=0.01)
+        peaks = f[maxima]
+        peaks = peaks[(peaks > 1.5) & (peaks < 2.5)]
+        found.append(len(peaks) > 0)
+        listed = ", ".join(f"{x:.3g}" for x in peaks) or "none"
+        places.append(f"{listed} ({output})")
+    text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
+    return _noted(f"{name}: bumps of H_0 around f = 2", any(found), text)
+
+
+def _about_higher_harmonics(name: str, family: Any) -> dict:
+    """Compare the second harmonics, and all beyond the first, with the others."""
+    H = np.asarray(family.estimate.H)[..., 0]
+    power = np.sum(np.abs(H) ** 2, axis=1)
+    order = np.abs(np.array(family.estimate.harmonics))
+    total = power.sum(axis=0)
+    to_first = power[order <= 1].sum(axis=0) / total
+    to_second = power[order <= 2].sum(axis=0) / total
+    second = np.maximum(_largest(family, 2), _largest(family, -2))
+    second = second / _largest(family, 0)
+    text = (
+        f"max|H_+-2| / max|H_0|: {_pairs(second)}; part of the sum of |H_m|^2 with "
+        f"|m| <= 1: {_pairs(to_first)}, with |m| <= 2: {_pairs(to_second)}"
+    )
+    claim = f"{name}: |H_m| is negligible for |m| >= 2"
+    return _noted(claim, np.all(second < 0.1), text)
+
+
+def _about_fits(name: str, family: Any) -> dict:
+    """Compare the eigenvalues of the fits with the exact ones."""
+    true = family.ldtp.multipliers
+    errors = [family.rational.compare(true, k).max_error for k in OUTPUTS]
+    claim = (
+        f"{name}: eigenvalues from the fits are right up to the third significant digit"
+    )
+    return _noted(claim, max(errors) < 5e-3, f"|error|: {_pairs(errors)}")
 
 
 def table(summary: dict) -> str:
@@ -190,12 +212,14 @@ def table(summary: dict) -> str:
             "computed here.",
             "The reproduction has not failed: docs/paper-errata.md explains each difference.",
         ]
-    return "\n".join([*rows, "", f"Time: {summary['seconds']:.1f} s.", ""])
+    time = f"Time: {summary['seconds']:.1f} s."
+    return "\n".join([*rows, "", time, ""])
 
 
 def complex_pairs(values) -> list[list[float]]:
     """Return real and imaginary parts, as JSON holds them."""
-    return [[float(z.real), float(z.imag)] for z in np.asarray(values).ravel()]
+    flat = np.asarray(values).ravel()
+    return [[float(z.real), float(z.imag)] for z in flat]
 
 
 def _pairs(values) -> str:

@@ -68,7 +68,8 @@ class Family(NamedTuple):
 
 def _log(begin: float, text: str) -> None:
     """Print a finished step with the seconds since `begin`."""
-    print(f"[{time.time() - begin:6.1f} s] {text}", flush=True)
+    since = time.time() - begin
+    print(f"[{since:6.1f} s] {text}", flush=True)
 
 
 def reproduce(
@@ -90,7 +91,8 @@ def reproduce(
     figures = [*cycles, "fig3_harmonics", "fig4_bode", "multipliers", "poles_zeros"]
     files = ["summary.json"]
     files += map(".".join, itertools.product(figures, formats))
-    files += [f"{x}_{family}.npz" for family, x in itertools.product(_FAMILIES, _SAVED)]
+    pairs = itertools.product(_FAMILIES, _SAVED)
+    files += [f"{x}_{family}.npz" for family, x in pairs]
     with results_folder(Path(out), "reproduce", files) as folder:
         return _reproduce(folder, protocol, formats)
 

@@ -369,7 +369,8 @@ def _write(
                     f'<figure><img alt="{caption}" src="{name}.png"><figcaption>{caption}, of '
                     "each subject, with 95 % intervals.</figcaption></figure>"
                 )
-        parts.append(html.card("Reports", "", f"<ul>{''.join(links)}</ul>"))
+        items = f"<ul>{''.join(links)}</ul>"
+        parts.append(html.card("Reports", "", items))
         subjects.to_csv(new / _FILES[0], index=False)
         results.to_csv(new / _FILES[1], index=False)
         page = page_of("Floquet multipliers of several subjects", parts)

@@ -162,8 +162,10 @@ class HarmonicStateSpace(NamedTuple):
         """Responses of all harmonics to inputs of `frequencies` (F,) in cycles per period."""
         M = 2 * self.order + 1
         # (Inputs have the harmonic 0 only.)
-        B = self.B.reshape(len(self.B), M, -1)[:, self.order]
-        D = self.D.reshape(len(self.D), M, -1)[:, self.order]
+        by_turn = self.B.reshape(len(self.B), M, -1)
+        B = by_turn[:, self.order]
+        direct = self.D.reshape(len(self.D), M, -1)
+        D = direct[:, self.order]
         f = np.asarray(frequencies).reshape(-1, 1, 1)
         rates = 2j * np.pi * f / period
         resolvent = rates * np.eye(len(self.A)) - self.A
@@ -215,7 +217,8 @@ def to_harmonic_state_space(
 
     **Before:** `hj.find_limit_cycle`.
     """
-    exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
+    htf = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs)
+    exact = htf.H.swapaxes(0, 1)
     map = hosted(cycle).return_map
     s = map.structure
     period = map.expected
@@ -252,8 +255,10 @@ def to_harmonic_state_space(
             order=n,
             error=np.nan,
         )
-        truncated = space.transfer(_TRIED, period)[:, n - 1 : n + 2]
-        error = np.abs(truncated - exact).max() / np.abs(exact).max()
+        response = space.transfer(_TRIED, period)
+        truncated = response[:, n - 1 : n + 2]
+        largest = np.abs(exact).max()
+        error = np.abs(truncated - exact).max() / largest
         space = space._replace(error=float(error))
         if order or space.error < tolerance:
             return space
@@ -269,11 +274,13 @@ def _toeplitz(
     """The matrix with the Fourier coefficient m - n of x (p, k, i, j) in block (m, n), by a
     quadrature with these angles and weights (p, k)."""
     k = np.arange(-2 * order, 2 * order + 1)
-    waves = weights * np.exp(-1j * k[:, None, None] * angles)
+    turns = np.exp(-1j * k[:, None, None] * angles)
+    waves = weights * turns
     coefficients = np.einsum("mpk,pkij->mij", waves, x)
     m = np.arange(-order, order + 1)
     blocks = coefficients[m[:, None] - m + 2 * order]
-    return blocks.swapaxes(1, 2).reshape(len(m) * x.shape[2], -1)
+    by_rows = blocks.swapaxes(1, 2)
+    return by_rows.reshape(len(m) * x.shape[2], -1)
 
 
 @checked
@@ -306,4 +313,5 @@ def to_scipy(model: LDTP, *, period: Positive = 1.0) -> Any:
 
 
 def _matrices(lti: LDTP) -> list[np.ndarray]:
-    return [np.asarray(x[0]) for x in (lti.A, lti.B, lti.C, lti.D)]
+    matrices = (lti.A, lti.B, lti.C, lti.D)
+    return [np.asarray(x[0]) for x in matrices]

@@ -75,7 +75,8 @@ def _(thing: Recording | SectionData | LimitCycles | Branch) -> Any:
             continue
         numbers = {name: x.values}
         if x.ndim > 1:
-            numbers = {f"{name}.{k}": values for k, values in enumerate(x.values.T)}
+            columns = enumerate(x.values.T)
+            numbers = {f"{name}.{k}": values for k, values in columns}
         for key, values in numbers.items():
             table |= (
                 _parts(f"{key}.", values) if np.iscomplexobj(values) else {key: values}
@@ -132,7 +133,8 @@ def _(thing: ParameterFit) -> Any:
 
 @_columns.register
 def _(thing: RationalFit) -> Any:
-    outputs = np.repeat(list(map(str, thing.outputs)), thing.poles.shape[1])
+    names = list(map(str, thing.outputs))
+    outputs = np.repeat(names, thing.poles.shape[1])
     poles = _parts("pole_", thing.poles.ravel())
     return {"output": outputs, **poles, **_parts("", thing.multipliers.ravel())}
 

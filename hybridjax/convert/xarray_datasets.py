@@ -134,7 +134,8 @@ def from_xarray(dataset: Any) -> Saved:
             order = dataset[dimension].values
             whole = dimension == "section"
             late = order[0] % (size if whole else static["n_sections"])
-            if late or (np.diff(order) != 1).any() or (whole and len(order) < size):
+            has_gaps = (np.diff(order) != 1).any()
+            if late or has_gaps or (whole and len(order) < size):
                 raise DefinitionError(
                     f"`{dimension}` must be in order, from section 0 on."
                 )

@@ -82,7 +82,8 @@ def certify(
         # The tangent of a quadratic limit may leave some powers unbounded.
         return Certificate(np.inf, np.full(len(power), np.nan))
     price = -best.ineqlin.marginals @ (limits.cost * alone)
-    relative = gain / gain.max() / np.where(price > 0, price, np.nan)
+    known_price = np.where(price > 0, price, np.nan)
+    relative = gain / gain.max() / known_price
     return Certificate(float(-best.fun * gain.max()), -best.fun * relative)
 
 

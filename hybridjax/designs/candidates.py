@@ -83,7 +83,8 @@ class Candidates(NamedTuple):
     ) -> Complex[np.ndarray, "K M ny"]:
         """Return the HTFs of each cosine's input at its frequency."""
         f, place = np.unique(self.f, return_inverse=True)
-        return np.asarray(model.htf(f, harmonics).H)[:, place, :, self.channel]
+        H = np.asarray(model.htf(f, harmonics).H)
+        return H[:, place, :, self.channel]
 
     def places(self, design: Design) -> Int[np.ndarray, " L"]:
         """Return the index of the cosine that each line of a design is."""
@@ -111,7 +112,8 @@ def mean_squares(model: Model, cosines: Candidates) -> Squares:
     The rate is the change from one section to the next: a cosine of f changes by
     $2 \\sin(\\pi f / N)$ times its amplitude.
     """
-    change = 4 * np.sin(np.pi * cosines.f / cosines.n_sections) ** 2
+    half_angle = np.pi * cosines.f / cosines.n_sections
+    change = 4 * np.sin(half_angle) ** 2
     squares: Squares = {}
     for i, name in enumerate(model.inputs):
         own = (cosines.channel == i).astype(float)
@@ -215,7 +217,8 @@ def measured_htfs(
         samples = cosines.n_sections * cosines.cycles
         variance: Any = 2 * spectrum[..., None] / samples
         H: Any = np.asarray(htf.H)[:, :, noise.outputs, i : i + 1]
-        larger = np.mean(np.abs(H) ** 2) / np.mean(variance) or 1.0
+        power = np.mean(np.abs(H) ** 2)
+        larger = power / np.mean(variance) or 1.0
         htf = dataclasses.replace(
             htf,
             H=H,

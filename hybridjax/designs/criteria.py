@@ -125,7 +125,8 @@ def wanted_parts(
             raise DefinitionError(
                 f"the multiplier {z:.4g} is double: choose another `goal`."
             )
-        gradient = -(z ** np.arange(d - 1, -1, -1)) / slope[k]
+        powers = np.arange(d - 1, -1, -1)
+        gradient = -(z**powers) / slope[k]
         name = f"{z.real:.4g}"
         rows = [gradient.real]
         if z.imag != 0:
@@ -158,7 +159,8 @@ def _parameters(
             raise DefinitionError(
                 f"the data do not identify {lost}: leave it out of `free`."
             )
-        shape = 2, len(htf.harmonics), len(members), htf.H[0, 0].size
+        entries = htf.H[0, 0].size
+        shape = 2, len(htf.harmonics), len(members), entries
         cosine = np.broadcast_to(members[:, None], shape).ravel()
         channels.append(Channel(cosine, weight * data.sensitivity))
     rows = np.eye(len(free))[[free.index(name) for name in wanted]]

@@ -127,7 +127,8 @@ class Criterion(eqx.Module):
         bounds = [criterion.bound(power) for criterion in self.each]
         criteria = np.array([bound.criterion for bound in bounds])
         top = criteria.max()
-        mean = top * np.mean((criteria / top) ** self.exponent) ** (1 / self.exponent)
+        relative = np.mean((criteria / top) ** self.exponent)
+        mean = top * relative ** (1 / self.exponent)
         share = (criteria / mean) ** (self.exponent - 1) / len(criteria)
         variances = (
             share @ np.array([bound.variances for bound in bounds]) / share.sum()
@@ -151,7 +152,8 @@ def _root(
         raise DefinitionError(
             f"{unknowns[lost[0]]} changes no response: drop it or add an output."
         )
-    values, vectors = np.linalg.eigh(matrix / size / size[:, None])
+    scaled = matrix / size / size[:, None]
+    values, vectors = np.linalg.eigh(scaled)
     # (Relative to the largest one, for combinations of matrices.)
     if not values[0] > ROUNDING:
         direction = vectors[:, 0] / size

@@ -185,12 +185,15 @@ class PowerLimits(NamedTuple):
     def price(self, prices: Float[np.ndarray, " L"]) -> Powers:
         """Return the price of a unit of each cosine's power, which is positive even where the
         tangent of a quadratic limit is not."""
-        return np.maximum(prices @ self.cost, _LEAST * (prices @ np.abs(self.cost)))
+        total = prices @ self.cost
+        least = _LEAST * (prices @ np.abs(self.cost))
+        return np.maximum(total, least)
 
     def share(self, power: Powers) -> Powers:
         """Return the average share of the limits that a unit of each cosine's power takes."""
         flat = self.tangent(power)
-        return flat.price(np.full(len(flat.cost), 1 / len(flat.cost)))
+        number = len(flat.cost)
+        return flat.price(np.full(number, 1 / number))
 
     def only(self, kept: Kept) -> "PowerLimits":
         return self._replace(
@@ -285,7 +288,8 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
     factor = np.ones_like(highest)
     for name, most in peak.items():
         i = design.inputs.index(name)
-        factor[:, i] = most / np.maximum(highest[:, i], most)
+        larger = np.maximum(highest[:, i], most)
+        factor[:, i] = most / larger
     amplitude = np.asarray(design.amplitude) * factor[design.experiment, design.channel]
     return dataclasses.replace(design, amplitude=amplitude)
 
@@ -374,6 +378,7 @@ def _convex(form: Float[np.ndarray, "K K"], unit: Powers) -> Float[np.ndarray, "
     """Return the nearest positive semidefinite matrix that exceeds the form by another such matrix,
     in units of each cosine's power. (In units in which each alone distorts alike the bound of the
     hopper is up to two times as large where power belongs.)"""
-    values, vectors = np.linalg.eigh(form * unit[:, None] * unit)
+    scaled = form * unit[:, None] * unit
+    values, vectors = np.linalg.eigh(scaled)
     positive = (vectors * np.maximum(values, 0)) @ vectors.T
     return positive / unit[:, None] / unit

@@ -99,7 +99,8 @@ def ldtp_matrices(
     coordinates = local_coordinates(PeriodicModel.of(realized(response), scale), direct)
     gram = np.zeros((coordinates.size, coordinates.size))
     for lines, rows in _rows(coordinates, htfs, scale):
-        flat = _flat(rows * np.sqrt(power[lines])[:, None, None])
+        amplitude = np.sqrt(power[lines])[:, None, None]
+        flat = _flat(rows * amplitude)
         gram += flat @ flat.T
     spread = NormalEquations(gram, np.zeros(len(gram))).spread()
     cosine = []
@@ -154,7 +155,8 @@ def response_criterion(
     H = transfer(matrices.coordinates.model, f, harmonics)
     parts = [part for _, part in transfer_slopes(matrices.coordinates, f, harmonics)]
     slopes = np.concatenate(parts, axis=2)
-    size = np.sqrt((np.abs(H) ** 2).mean(axis=1).sum(axis=0))  # (ny, nu)
+    square = (np.abs(H) ** 2).mean(axis=1)
+    size = np.sqrt(square.sum(axis=0))  # (ny, nu)
     slopes = np.stack([np.real(slopes), np.imag(slopes)], axis=3)
     slopes = slopes / size / np.sqrt(_POINTS)
     names = []
@@ -170,5 +172,6 @@ def response_criterion(
     rows = []
     for s, v, k in zip(values, vectors, kept, strict=True):
         rows.append(s[k, None] * v[k])
-    part = np.repeat(np.arange(len(rows)), [len(x) for x in rows])
+    lengths = [len(x) for x in rows]
+    part = np.repeat(np.arange(len(rows)), lengths)
     return matrices.criterion(np.concatenate(rows), tuple(names), part)

@@ -155,7 +155,8 @@ class OptimalDesign(Showable, eqx.Module):
 
     def __repr__(self) -> str:
         rows = [("", self.usual_name, "optimal")]
-        rows.append(("cycles", str(self.usual.cycles(0)), str(self.cycles)))
+        usual = str(self.usual.cycles(0))
+        rows.append(("cycles", usual, str(self.cycles)))
         errors = zip(
             self.names, self.usual_standard_errors, self.standard_errors, strict=True
         )
@@ -165,7 +166,8 @@ class OptimalDesign(Showable, eqx.Module):
         ]
         rms = ((n, x) for n, x in self.usual_rms.items() if x > 0)
         for n, x in rms:
-            rows.append((f"rms of {n}", f"{x:.3g}", f"{self.rms[n]:.3g}"))
+            designed = f"{self.rms[n]:.3g}"
+            rows.append((f"rms of {n}", f"{x:.3g}", designed))
         bounded = any(n.startswith("distortion of ") for n in self.rms)
         certificate = (
             f"certificate {self.certificate:.3f} (1 at the optimum):\n  "
@@ -245,7 +247,8 @@ class Rules(NamedTuple):
             rms = self.distorted(design)
             for name, level in zip(rms, self.distortion.level, strict=True):
                 use[name] = rms[name] / level
-        return tuple(name for name, share in use.items() if share > 1 / (1 + ENOUGH))
+        full = 1 / (1 + ENOUGH)
+        return tuple(name for name, share in use.items() if share > full)
 
 
 @checked

@@ -72,7 +72,8 @@ def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
     power = np.concatenate(gram)[:, None]
     along = np.concatenate([sums.along[:, 0] for sums in each])
     H = (along.swapaxes(0, 1) / power)[..., None]
-    variance = np.broadcast_to((N * P / repeats / power)[..., None], H.shape)
+    by_line = N * P / repeats / power
+    variance = np.broadcast_to(by_line[..., None], H.shape)
     htf = HTF(
         np.arange(len(line)),
         H,
@@ -84,7 +85,8 @@ def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
     )
     # Frequencies may occur several times, measured each time on their own.
     htf = eqx.tree_at(lambda htf: htf.frequencies, htf, from_host(line / P))
-    return Block(htf, data.u.shape[0] * data.u.shape[1] // N)
+    cycles = data.u.shape[0] * data.u.shape[1] // N
+    return Block(htf, cycles)
 
 
 class Estimate(NamedTuple):
@@ -123,7 +125,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
     htfs = to_host([block.htf for block in blocks])
     f = np.concatenate([x.frequencies for x in htfs])
     H = np.concatenate([x.H for x in htfs], axis=1)
-    member = np.repeat(np.arange(len(blocks)), [len(htf.frequencies) for htf in htfs])
+    counts = [len(htf.frequencies) for htf in htfs]
+    member = np.repeat(np.arange(len(blocks)), counts)
     # To begin with, all of it may be noise.
     relative = [np.abs(htf.H) ** 2 / htf.variance for htf in htfs]
     noise = np.sqrt([np.mean(x, axis=(0, 1, 3)) for x in relative])
@@ -227,7 +230,8 @@ def refuse_transient(
         return
     k = min(1, before - 1)
     whole = y.shape[1] // N * N
-    cycles = y[:, :whole].reshape(len(y), -1, N, y.shape[2])
+    kept = y[:, :whole]
+    cycles = kept.reshape(len(y), -1, N, y.shape[2])
     early = cycles[:, k]
     late = cycles[:, k + P]
     difference = np.mean((early - late) ** 2, axis=(0, 1))

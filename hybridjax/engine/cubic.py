@@ -118,7 +118,8 @@ class _Cubic(NamedTuple):
         return cls(v0, d0, b, c)
 
     def value(self, s):
-        return self.v0 + s * (self.d0 + s * (self.b + s * self.c))
+        quadratic = self.b + s * self.c
+        return self.v0 + s * (self.d0 + s * quadratic)
 
     def slope(self, s):
         return self.d0 + s * (2 * self.b + s * 3 * self.c)

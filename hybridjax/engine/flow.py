@@ -6,7 +6,7 @@ from the tape, and get their derivatives in the same way.
 """
 
 import functools as ft
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -109,7 +109,8 @@ def _passed(
 def _passed_jvp(primals, tangents):
     s, lanes, u, target, times, settings, options, most_events, result = primals
     still = fixed((s, lanes, u, target))
-    moved, tape = _recorded(*still, settings, options._replace(tangents=True), result)
+    with_tangents = options._replace(tangents=True)
+    moved, tape = _recorded(*still, settings, with_tangents, result)
     target, levels = target.split()
 
     def repeat(by_lane, common):
@@ -128,20 +129,26 @@ def _passed_jvp(primals, tangents):
     common = (s, levels), (t_s, t_target.levels)
     ends, t_ends = lane_jvp(repeat, (point, t_point), common)
 
-    def put(passage, ends):
-        def places(x):
-            return x.moved.lanes.t, x.moved.lanes.q, *x.events.smooth, x.samples.q
-
-        return eqx.tree_at(places, passage, ends, is_leaf=lambda x: x is None)
-
     ways = Ways(tape.t, tape.before, tape.after)
     chart = jnp.zeros(times.shape, jnp.int32)
     if len(times):
         chart = _before(lanes, tape, ways, times).chart.reshape(times.shape)
     samples = Samples(chart, ends[-1])
-    out = put(Passage(moved, _events(tape, ways, most_events), samples), ends)
+    events = _events(tape, ways, most_events)
+    out = _with_values(Passage(moved, events, samples), ends)
     none = jax.tree_util.tree_map(lambda _: None, out)
-    return out, put(none, t_ends)
+    return out, _with_values(none, t_ends)
+
+
+def _with_values(passage: Passage, values: Any) -> Passage:
+    """A passage with these values, or their tangents: the times and states of the ends, what is
+    smooth of the events, and the states of the samples."""
+
+    def places(passage):
+        lanes = passage.moved.lanes
+        return lanes.t, lanes.q, *passage.events.smooth, passage.samples.q
+
+    return eqx.tree_at(places, passage, values, is_leaf=lambda x: x is None)
 
 
 def _samples(
@@ -156,17 +163,24 @@ def _samples(
     of the flow have no meaning."""
     K, L = times.shape
     if not K:
-        return Samples(jnp.zeros((0, L), jnp.int32), jnp.zeros((0, s.d, L)))
-    last = jnp.max(jnp.where(tape.code != IDLE, tape.t, lanes.t), axis=0)
+        no_charts = jnp.zeros((0, L), jnp.int32)
+        no_states = jnp.zeros((0, s.d, L))
+        return Samples(no_charts, no_states)
+    ends = jnp.where(tape.code != IDLE, tape.t, lanes.t)
+    last = jnp.max(ends, axis=0)
     within = _is_within(times, lanes, last).ravel()
     begin = _before(lanes, tape, ways, times)
     # (No step is taken to times outside, where a state may leave all bounds.)
     every = jnp.where(within, times.ravel(), begin.t)
     row = blank_tape(1, begin)
-    row = row._replace(code=jnp.full((1, K * L), ARRIVE_TIME, jnp.int32))
-    inputs = u if u.shape[-1] == 1 else jnp.tile(u, (1, K))
+    code = jnp.full((1, K * L), ARRIVE_TIME, jnp.int32)
+    row = row._replace(code=code)
+    inputs = u
+    if u.shape[-1] > 1:
+        inputs = jnp.tile(u, (1, K))
     _, q = replay(s, begin, inputs, until(every), row)
-    q = jnp.moveaxis(q.reshape(-1, K, L), 1, 0)
+    by_time = q.reshape(-1, K, L)
+    q = jnp.moveaxis(by_time, 1, 0)
     return Samples(begin.chart.reshape(K, L), q)
 
 
@@ -176,7 +190,8 @@ def _is_within(
     """Test whether times lie between the start and the end, which other programs know but for
     rounding."""
     times, start, end = jax.lax.stop_gradient((times, lanes.t, end))
-    late = INSTANT * (end - start) + ROUNDING * jnp.abs(end)
+    duration = end - start
+    late = INSTANT * duration + ROUNDING * jnp.abs(end)
     return (times >= start) & (times <= end + late)
 
 
@@ -185,25 +200,31 @@ def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) ->
     rows = jnp.arange(len(tape.code))[:, None]
     is_move = tape.code != IDLE
     # (The last move that ends before each time; -1 for none.)
-    ended = is_move & (tape.t <= jax.lax.stop_gradient(times)[:, None])
+    fixed_times = jax.lax.stop_gradient(times)[:, None]
+    ended = is_move & (tape.t <= fixed_times)
     row = jnp.max(jnp.where(ended, rows, -1), axis=1)
     first = row < 0
     place = jnp.maximum(row, 0)
 
     def chosen(start, ends):
-        return jnp.where(first, start, jnp.take_along_axis(ends, place, axis=0)).ravel()
+        last_end = jnp.take_along_axis(ends, place, axis=0)
+        return jnp.where(first, start, last_end).ravel()
 
     states = jnp.take_along_axis(ways.after, place[:, None], axis=0)
     q = jnp.where(first[:, None], lanes.q, states)
     K, d, L = q.shape
-    t, chart = chosen(lanes.t, ways.t), chosen(lanes.chart, tape.chart)
-    q = jnp.moveaxis(q, 0, 1).reshape(d, K * L)
+    t = chosen(lanes.t, ways.t)
+    chart = chosen(lanes.chart, tape.chart)
+    by_state = jnp.moveaxis(q, 0, 1)
+    q = by_state.reshape(d, K * L)
     armed = jnp.tile(lanes.armed, (1, K))
-    return Lanes(t, chart, q, armed, chart * 0, pace_of(chart * 0))
+    no_event = chart * 0
+    return Lanes(t, chart, q, armed, no_event, pace_of(no_event))
 
 
 def _recorded(s, lanes, u, target, settings, options, result) -> tuple[Moved, Tape]:
-    first = initial_step(s, lanes, u, target.limit - lanes.t, settings)
+    longest = target.limit - lanes.t
+    first = initial_step(s, lanes, u, longest, settings)
     setout = fixed(stride(first))
     recorded = searched(s, lanes, u, target, setout, result, settings, options)
     assert recorded.tape is not None
@@ -217,7 +238,8 @@ def _events(tape: Tape, ways: Ways, most: int) -> Events:
     first = ft.partial(jnp.searchsorted, v=number)
     row = jax.vmap(first, in_axes=1, out_axes=1)(tape.events)
     row = jnp.minimum(row, len(tape.events) - 1)
-    exists = jnp.take_along_axis(tape.events, row, axis=0) == number[:, None]
+    found = jnp.take_along_axis(tape.events, row, axis=0)
+    exists = found == number[:, None]
 
     def times(x):
         return jnp.take_along_axis(x, row, axis=0)

@@ -87,14 +87,16 @@ def _weights(
     if np.abs(weights[:, 0]).max() > _LARGEST:
         return None
     full = np.zeros((2, len(a)))
-    full[:, usable] = np.where(np.abs(weights) < _ROUNDING, 0.0, weights).T
+    is_rounding = np.abs(weights) < _ROUNDING
+    full[:, usable] = np.where(is_rounding, 0.0, weights).T
     return full
 
 
 @ft.lru_cache
 def _trees(size: int) -> tuple[Tree, ...]:
     """All rooted trees of so many nodes."""
-    return tuple(dict.fromkeys(tuple(sorted(x)) for x in _forests(size - 1)))
+    trees = (tuple(sorted(x)) for x in _forests(size - 1))
+    return tuple(dict.fromkeys(trees))
 
 
 def _forests(size: int) -> list[Tree]:

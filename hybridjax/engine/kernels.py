@@ -63,7 +63,8 @@ def step(
     s: Structure, a: int, t: Times, q: States, u: Inputs, h: Times, some: Some = None
 ) -> Step:
     """A step in chart a, without derivatives."""
-    of_lanes = s.kernel(_field, _ByMethod(_step, s.method(a)), a)
+    method = _ByMethod(_step, s.method(a))
+    of_lanes = s.kernel(_field, method, a)
     return Step(*of_lanes(t, q, u, h, some=some))
 
 
@@ -78,7 +79,8 @@ def step_along(
     some: Some,
 ) -> tuple[Step, States, States]:
     """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
-    of_lanes = s.kernel(_field, _ByMethod(_step_along, s.method(a)), a)
+    method = _ByMethod(_step_along, s.method(a))
+    of_lanes = s.kernel(_field, method, a)
     *step, end, estimate = of_lanes(t, q, u, h, along, some=some)
     return Step(*step), end, estimate
 
@@ -120,8 +122,10 @@ def reset(
 ) -> Expanded:
     """The state after transitions of one kind, and (on the host) its derivatives."""
     if on_host(q):
-        return s.kernel(_reset, _expanded, g.kind)(t, q, u, g.place, some=some)
-    return s.by_lane(ft.partial(_reset, g.kind))(t, q, u, g.place)[:, None]
+        run = s.kernel(_reset, _expanded, g.kind)
+        return run(t, q, u, g.place, some=some)
+    by_lane = s.by_lane(ft.partial(_reset, g.kind))
+    return by_lane(t, q, u, g.place)[:, None]
 
 
 def enabled(
@@ -129,8 +133,10 @@ def enabled(
 ) -> Bool[Array, " L"]:
     """Test whether the predicates of transitions of one kind hold."""
     if on_host(q):
-        return s.kernel(_enabled, by_lane, g.kind, lanes=lanes)(t, q, u, g.place)
-    return s.by_lane(ft.partial(_enabled, g.kind))(t, q, u, g.place)
+        run = s.kernel(_enabled, by_lane, g.kind, lanes=lanes)
+        return run(t, q, u, g.place)
+    predicate = s.by_lane(ft.partial(_enabled, g.kind))
+    return predicate(t, q, u, g.place)
 
 
 def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
@@ -141,11 +147,13 @@ def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
 def by_parameter_of_period(s: Structure) -> Any:
     """The derivative of the period of a clock by the only input, which is added to a parameter."""
     if is_traced(s):
-        return jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))(jnp.zeros(1))[0, 0]
+        by_input = jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))
+        return by_input(jnp.zeros(1))[0, 0]
     t = np.zeros(1)
     no_state = np.zeros((0, 1))
     u = np.zeros((1, 1))
-    return s.kernel(_period, _expanded)(t, no_state, u)[0, -1, 0]
+    rows = s.kernel(_period, _expanded)(t, no_state, u)
+    return rows[0, -1, 0]
 
 
 def outputs(
@@ -166,7 +174,8 @@ def linear(
 ) -> Expanded:
     """A vector function (chart, structure, *trees, t, q, u) of chart a, and its derivatives."""
     if not on_host(q):
-        of_point = _columns(ft.partial(function, a), 1 + len(trees))
+        function_of_chart = ft.partial(function, a)
+        of_point = _columns(function_of_chart, 1 + len(trees))
         return s.by_lane(of_point, *trees)(t, q, u)
     lanes = POINTS if q.shape[-1] < 16 * POINTS else 4 * POINTS
     return s.kernel(function, _expanded, a, trees=trees, lanes=lanes)(t, q, u)
@@ -237,9 +246,11 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
         def level(t, q):
             return levels.level(s, a, i, t, q)
 
-        return jax.jvp(level, (t, q), (jnp.ones_like(t), f))
+        rates = (jnp.ones_like(t), f)
+        return jax.jvp(level, (t, q), rates)
 
-    return jnp.stack(jax.vmap(along)(jnp.arange(n_sections, dtype=np.int32)), axis=1)
+    indices = jnp.arange(n_sections, dtype=np.int32)
+    return jnp.stack(jax.vmap(along)(indices), axis=1)
 
 
 # Forms: what is computed of a function, for lanes.
@@ -263,12 +274,15 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
             return function(*bound, t, q, u, *further)
 
         def split(x):
-            return (x[0], x[1 : 1 + n], x[1 + n :])
+            q = x[1 : 1 + n]
+            u = x[1 + n :]
+            return (x[0], q, u)
 
         def push(dx):
             return jax.jvp(at, (t, q, u), split(dx))
 
-        value, columns = jax.vmap(push, out_axes=(None, 1))(jnp.eye(m))
+        columns_of = jax.vmap(push, out_axes=(None, 1))
+        value, columns = columns_of(jnp.eye(m))
         return jnp.concatenate([value[:, None], columns], axis=1)
 
     return expand
@@ -297,7 +311,8 @@ class Tangents(Structure):
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
         """Inputs of zero, and the directions of lanes; of negative index, none."""
         along = np.arange(self.directions)[:, None] == direction
-        return np.concatenate([np.zeros((self.nu, len(direction))), along])
+        still = np.zeros((self.nu, len(direction)))
+        return np.concatenate([still, along])
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
@@ -371,13 +386,15 @@ class _BySystem(NamedTuple):
     def __call__(self, function: Callable, s: Structure, *trees: Any) -> Callable:
         arrays, static = eqx.partition(s, eqx.is_array)
         leaves, structure = jax.tree_util.tree_flatten(arrays)
-        ends = np.cumsum([x.size for x in leaves])[:-1]
+        sizes = [x.size for x in leaves]
+        ends = np.cumsum(sizes)[:-1]
 
         def lanes(numbers, *point):
             parts = zip(leaves, jnp.split(numbers, ends), strict=True)
             arrays = [y.reshape(*x.shape, -1).astype(x.dtype) for x, y in parts]
             numbers = jax.tree_util.tree_unflatten(structure, arrays)
-            systems = PerLane(eqx.combine(numbers, static), (True,) * len(arrays))
+            by_lane = (True,) * len(arrays)
+            systems = PerLane(eqx.combine(numbers, static), by_lane)
             return self.form(function, systems, *trees)(*point)
 
         return lanes
@@ -493,5 +510,6 @@ def _linear_step(method: Method, field: Callable, t, q, u, h, *x):
         return value, f, tangent
 
     unit = jnp.eye(split[-1] + 1)
-    value, f, columns = jax.vmap(push, out_axes=(None, None, 1))(unit)
+    along = jax.vmap(push, out_axes=(None, None, 1))
+    value, f, columns = along(unit)
     return jnp.concatenate([value[:, None], f[:, None], columns], axis=1)

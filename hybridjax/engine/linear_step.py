@@ -40,7 +40,8 @@ def _explicit(method: Method, s: Structure, a: int, t, q, u, h):
     by_rates = np.zeros((stages, M, n, m), q.dtype)
     for i in range(stages):
         state, by_state = _state(a_rows[i, :i], rates, by_rates, q, h)
-        rates[i], by_rates[i] = _rate(s, a, method.c[i], t, u, h, state, by_state)
+        at_stage = method.c[i]
+        rates[i], by_rates[i] = _rate(s, a, at_stage, t, u, h, state, by_state)
     end, by_end = _state(np.array(method.b), rates, by_rates, q, h)
     field_at_end = kernels.field(s, a, t + h, end.T, u)
     rate = field_at_end[:, 0].T

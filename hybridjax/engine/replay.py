@@ -91,20 +91,23 @@ def _replayed(
     """The end of a recorded piece of flow, and if it `keeps` them, the ends of all moves."""
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
     scheduled = jnp.array([*is_scheduled, False])
+    level = len(s.transitions)
 
     def row(carry, row):
         h, code, at_once = row
 
         def move(carry):
             t, q, chart = carry
-            by_clock = (code >= 0) & scheduled[code]
+            is_event = code >= 0
+            by_clock = is_event & scheduled[code]
             due = scheduled_time(s, code, t + h)
             length = jnp.where(by_clock, due - t, h)
             length = jnp.where(code == ARRIVE_TIME, target.time - t, length)
-            which = jnp.where(code == ARRIVE_LEVEL, len(s.transitions), code)
+            which = jnp.where(code == ARRIVE_LEVEL, level, code)
             which = jnp.where(by_clock | at_once, -1, which)
             begin = lanes._replace(t=t, q=q, chart=chart)
-            t, q = _advance(s, begin, code != IDLE, u, target, length, which)
+            is_move = code != IDLE
+            t, q = _advance(s, begin, is_move, u, target, length, which)
             event = jnp.maximum(code, -1)
             after, chart = apply_resets(s, t, chart, q, u, event)
             return (t, after, chart), kept(t, q, after)
@@ -135,11 +138,15 @@ def _replayed(
     # mode keeps no more of a block than where it starts.
     rows, L = tape.h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
-    h = jnp.pad(tape.h, fill).reshape(-1, _BLOCK, L)
-    at_once = jnp.pad(tape.at_once, fill).reshape(-1, _BLOCK, L)
-    code = jnp.pad(tape.code, fill, constant_values=IDLE).reshape(-1, _BLOCK, L)
+    padded = jnp.pad(tape.h, fill)
+    h = padded.reshape(-1, _BLOCK, L)
+    padded_at_once = jnp.pad(tape.at_once, fill)
+    at_once = padded_at_once.reshape(-1, _BLOCK, L)
+    padded_code = jnp.pad(tape.code, fill, constant_values=IDLE)
+    code = padded_code.reshape(-1, _BLOCK, L)
     begin = lanes.t, lanes.q, lanes.chart
-    (t, q, _), ways = jax.lax.scan(block, begin, (h, code, at_once))
+    rows_of_blocks = (h, code, at_once)
+    (t, q, _), ways = jax.lax.scan(block, begin, rows_of_blocks)
     in_rows = jax.tree_util.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ways)
     return (t, q), in_rows
 
@@ -186,7 +193,8 @@ def _advance(
         if flow.rows:
             t1, q1 = jax.lax.cond(some(crossing >= 0), land, lambda: (t1, q1))
         t_out = jnp.where(here, t1, t_out)
-        q_out = q_out.at[:n].set(jnp.where(here, q1, q_out[:n]))
+        moved = jnp.where(here, q1, q_out[:n])
+        q_out = q_out.at[:n].set(moved)
         return t_out, q_out
 
     return for_each_chart(s, chart, moving, work, (t, q))
@@ -229,8 +237,10 @@ def chain(
         u = np.zeros((s.nu, 1))
         f = slopes(s, moves.t, moves.chart, moves.q, u).T
         flows = ~moves.at_once  # (there is no flow before an event at once)
-        project = projections(f[flows], np.asarray(across)[moves.chart[flows]])
-        by[flows, :, 1:n] = by[flows, :, 1:n] @ project
+        sizes = np.asarray(across)[moves.chart[flows]]
+        project = projections(f[flows], sizes)
+        by_state = by[flows, :, 1:n]
+        by[flows, :, 1:n] = by_state @ project
     columns = _products(moves, by, len(lanes.t))
     ends = np.concatenate([lanes.t[None], lanes.q])
     ends[:, moves.lane] = end.T  # (the last move of a lane comes last)
@@ -240,7 +250,8 @@ def chain(
 def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndarray:
     """Derivatives of (t, q) at the ends of lanes by (t, q, u) at their starts."""
     n, m = by.shape[1:]
-    columns = np.tile(np.eye(n, m, dtype=by.dtype), (L, 1, 1))
+    unit = np.eye(n, m, dtype=by.dtype)
+    columns = np.tile(unit, (L, 1, 1))
     by_start = by[:, :, :n]
     by_input = by[:, :, n:]
     for order in range(1 + max(moves.order, default=-1)):
@@ -279,7 +290,8 @@ class Variation:
             return np.repeat(x, n + P, axis=-1)
 
         M = len(moves.t)
-        aside = 1j * kernels.TINY * np.tile(np.eye(n, n + P), M)
+        each_start = np.tile(np.eye(n, n + P), M)
+        aside = 1j * kernels.TINY * each_start
         along = Moves(*map(many, moves))
         direction = np.arange(len(along.t)) % (n + P)
         lane = along.lane * (n + P) + direction
@@ -292,8 +304,10 @@ class Variation:
         moves_more = s.moving | times.any(axis=1)
         is_first = np.arange(P) == 0
         self._unit = np.eye(P)[moves_more | is_first]
-        needed = np.append(np.full(n, twice), self._unit.any(axis=0))
-        along = Moves(*(x[..., np.tile(needed, M)] for x in along))
+        own_lane = self._unit.any(axis=0)
+        needed = np.append(np.full(n, twice), own_lane)
+        of_moves = np.tile(needed, M)
+        along = Moves(*(x[..., of_moves] for x in along))
         unmoved = np.zeros((n, len(lanes.t)))
         later = np.concatenate([unmoved, times]).T.ravel()
         index = np.broadcast_to(target.index, target.time.shape)
@@ -303,11 +317,13 @@ class Variation:
             index=many(index),
         )
         end, by = linear_moves(s, along, target)
-        by = by.reshape(M, -1, *by.shape[1:])
+        shape = by.shape[1:]
+        by = by.reshape(M, -1, *shape)
         end = end.reshape(M, -1, n)
         self._by = np.real(by[:, 0])
         self._change = np.imag(by) / kernels.TINY
-        kick = np.imag(end[:, -len(self._unit) :]) / kernels.TINY
+        of_directions = end[:, -len(self._unit) :]
+        kick = np.imag(of_directions) / kernels.TINY
         self._kick = np.moveaxis(kick, 1, 2) @ self._unit
 
     def tangents(
@@ -315,8 +331,10 @@ class Variation:
     ) -> Float[np.ndarray, "moves n P"]:
         """Tangents of (t, q) where moves start, and at the last end."""
         starts = [begin]
-        for by, kick in zip(self._by[:, :, : len(begin)], self._kick, strict=True):
-            starts.append(by @ starts[-1] + kick)
+        by_start = self._by[:, :, : len(begin)]
+        for by, kick in zip(by_start, self._kick, strict=True):
+            carried = by @ starts[-1]
+            starts.append(carried + kick)
         return np.stack(starts)
 
     def jacobians(
@@ -329,35 +347,43 @@ class Variation:
         P = tangents.shape[2]
         unit = np.tile(self._unit, (M, 1, 1))
         along = np.concatenate([tangents[:-1], unit], axis=1)
-        by_direction = self._change.reshape(*along.shape[:2], n * m)
+        shape = along.shape[:2]
+        by_direction = self._change.reshape(*shape, n * m)
         change = np.moveaxis(along, 1, 2) @ by_direction
         change = change.reshape(M, P, n, m)
-        by = self._by[:, None] + 1j * kernels.TINY * change
+        aside = 1j * kernels.TINY * change
+        by = self._by[:, None] + aside
         if sizes is not None:
-            f = slopes(self._s, *self.points(tangents, np.arange(M)))
+            points = self.points(tangents, np.arange(M))
+            f = slopes(self._s, *points)
             f = f.T.reshape(M, P, n - 1)
             flows = ~moves.at_once
             size = sizes[moves.chart[flows]]
             project = projections(f[flows], size[:, None])
-            by[flows, ..., 1:n] = by[flows, ..., 1:n] @ project
+            by_state = by[flows, ..., 1:n]
+            by[flows, ..., 1:n] = by_state @ project
         direction = np.arange(M * P) % P
         lane = np.repeat(moves.lane, P) * P + direction
-        each = moves._replace(lane=lane, order=np.repeat(moves.order, P))
-        columns = _products(each, by.reshape(-1, n, m), len(self.first) * P)
+        order = np.repeat(moves.order, P)
+        each = moves._replace(lane=lane, order=order)
+        lanes = len(self.first) * P
+        columns = _products(each, by.reshape(-1, n, m), lanes)
         return columns.reshape(-1, P, n, m)
 
     def points(self, tangents: Float[np.ndarray, "moves n P"], move: Any) -> tuple:
         """Times, charts, states and inputs where some moves start, in each direction."""
         moves = self._moves
         n, P = tangents.shape[1:]
-        by_direction = np.moveaxis(tangents[move], 1, 0).reshape(n, -1)
+        moved = np.moveaxis(tangents[move], 1, 0)
+        by_direction = moved.reshape(n, -1)
         aside = 1j * kernels.TINY * by_direction
         t = np.repeat(moves.t[move], P)
         chart = np.repeat(moves.chart[move], P)
         q = np.repeat(moves.q[:, move], P, axis=-1)
         direction = np.arange(len(t)) % P
         inputs = self._s.pushed(direction)
-        return t + aside[0], chart, q + aside[1:], inputs
+        time = t + aside[0]
+        return time, chart, q + aside[1:], inputs
 
 
 def _until_ticks(
@@ -370,7 +396,8 @@ def _until_ticks(
         if isinstance(transition.guard, Scheduled) and at.any():
             end = (t + h).real[at] + 0j
             u = kernels.unpushed(s, lane[at])
-            late = kernels.due(s, g, end, q[:, at], u)[0, 0]
+            rows_due = kernels.due(s, g, end, q[:, at], u)
+            late = rows_due[0, 0]
             h[at] = end + late - t[at]
     return h
 
@@ -398,11 +425,15 @@ def projections(
     """Projections of states along the flow f, orthogonal in sizes."""
     xp = namespace(f)
     f = f / sizes
-    length = xp.sqrt(xp.sum(f * f, axis=-1, keepdims=True))
+    square = xp.sum(f * f, axis=-1, keepdims=True)
+    length = xp.sqrt(square)
     f = f / length
-    along = f[..., :, None] * f[..., None, :]
+    column = f[..., :, None]
+    line = f[..., None, :]
+    along = column * line
     project = np.eye(f.shape[-1]) - along
-    return project * sizes[..., :, None] / sizes[..., None, :]
+    in_sizes = project * sizes[..., :, None]
+    return in_sizes / sizes[..., None, :]
 
 
 def recorded_moves(lanes: Lanes, tape: Tape) -> Moves:
@@ -455,21 +486,24 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     h = np.where(moves.at_once, 0.0, moves.h)
     h = np.where(on_time, goal - moves.t, h)
     t = np.where(on_time, goal, moves.t + h)
-    expanded = linear_step(s, a, moves.t, moves.q[:n], u, h)
+    state = moves.q[:n]
+    expanded = linear_step(s, a, moves.t, state, u, h)
     expanded = np.array(np.moveaxis(expanded, -1, 0))
     q = expanded[:, :, 0].T
     field = expanded[:, :, 1].T
     by_start = expanded[:, :, 2:-1]
     by_length = expanded[:, :, -1:]
     # A step to a known time shrinks with t, and lasts until a schedule has come.
-    longer = np.zeros((len(t), 1, by_start.shape[2]), by_start.dtype)
+    shape = (len(t), 1, by_start.shape[2])
+    longer = np.zeros(shape, by_start.dtype)
     longer[:, 0, 0] = -1.0 * (by_clock | on_time)
     # (Only a varied parameter moves a schedule.)
     varied = s.schedules(a) if isinstance(s, Varied) else []
     moved = np.intersect1d(code, varied).astype(int)
     for g in moved.tolist():
         now = np.flatnonzero(code == g)
-        due = kernels.due(s, g, t[now], q[:, now], u[:, now])[0]
+        rows_due = kernels.due(s, g, t[now], q[:, now], u[:, now])
+        due = rows_due[0]
         by_parameter = due[2 + n :].T
         longer[now, 0, 1 + n :] = by_parameter
     dt = longer.copy()
@@ -497,7 +531,8 @@ def _at_zeros(
     if not len(lands):
         return ends
     crossed = crossed[lands]
-    index = np.broadcast_to(target.index, target.time.shape)[moves.lane[lands]]
+    index_of_lane = np.broadcast_to(target.index, target.time.shape)
+    index = index_of_lane[moves.lane[lands]]
     landing = s.at(lands)
     flow = ChartFlow(
         s=landing,
@@ -506,14 +541,17 @@ def _at_zeros(
         levels=target.levels,
         index=index,
     )
-    at_end = ends.t[lands], ends.q[:, lands], ends.field[:, lands]
+    state_at_end = ends.q[:, lands]
+    field_at_end = ends.field[:, lands]
+    at_end = ends.t[lands], state_at_end, field_at_end
     zero = flow.locate(*at_end, crossed)
     t = ends.t.copy()
     q = ends.q.copy()
     t[lands] += zero.past
     q[:, lands] = zero.q
     at = t[lands], q[:, lands], u[:, lands]
-    expanded = np.moveaxis(kernels.field(landing, a, *at), -1, 0)
+    rows = kernels.field(landing, a, *at)
+    expanded = np.moveaxis(rows, -1, 0)
     field = expanded[:, :, :1]
     by_field = by_point(expanded, n)
 
@@ -521,7 +559,8 @@ def _at_zeros(
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
     is_crossed = np.array(flow.rows)[:, None] == crossed
     row = np.argmax(is_crossed, axis=0)
-    watched = watched[row, :, np.arange(len(lands))][:, None]
+    own = watched[row, :, np.arange(len(lands))]
+    watched = own[:, None]
 
     # (Over the time past: nothing but rounding errors, with derivatives.)
     past = zero.past[:, None, None]
@@ -549,7 +588,8 @@ def _after_resets(
     M = len(ends.t)
     n = len(ends.q)
     end = np.zeros((M, 1 + s.d), ends.dq.dtype)
-    by = np.zeros((M, 1 + s.d, 1 + s.d + s.nu), ends.dq.dtype)
+    shape = (M, 1 + s.d, 1 + s.d + s.nu)
+    by = np.zeros(shape, ends.dq.dtype)
     inputs = slice(1 + s.d, 1 + s.d + s.nu)
     columns = np.r_[: 1 + n, inputs]
     end[:, 0] = ends.t
@@ -562,10 +602,12 @@ def _after_resets(
         after = ends.q[:, now]
         by_start = ends.dq[now]
         if kind != (-1,):
-            is_member = np.array(kind)[:, None] == event[now]
+            members = np.array(kind)[:, None]
+            is_member = members == event[now]
             place = np.argmax(is_member, axis=0)
             member = Member(kind, place.astype(np.int32))
-            reset = kernels.reset(s.at(now), member, ends.t[now], after, u[:, now])
+            times = ends.t[now]
+            reset = kernels.reset(s.at(now), member, times, after, u[:, now])
             after = reset[:, 0]
             by_reset = by_point(np.moveaxis(reset, -1, 0), n)
             by_start = chained(by_reset, ends.dt[now], by_start)

@@ -67,7 +67,8 @@ def take_step(
     combined: Any = _combine if unroll else _contract
     K = stages(method, field, t, q, h)
     error = h * combined(np.array(method.error), K)
-    end = q + h * combined(np.array(method.b), K)
+    slope = combined(np.array(method.b), K)
+    end = q + h * slope
     f1 = field(t + h, end)
     weights = halfway(method)
     if weights is None:
@@ -110,7 +111,8 @@ def looped_step(
     def stage(k, K):
         # (States and rates apart: XLA would compute one of them again in each row of the other.)
         y = apart(q + h * weighted(a[k], K))
-        rate = apart(field(t + c[k] * h, y))
+        time = t + c[k] * h
+        rate = apart(field(time, y))
         return jax.lax.dynamic_update_index_in_dim(K, rate, k, 0)
 
     nothing = jnp.zeros((stages, *q.shape), q.dtype)
@@ -151,7 +153,8 @@ def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> State
     shifts = [np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)]
     shifts = np.stack(shifts, axis=1)
     xp = namespace(q)
-    shifts = xp.asarray(shifts * xp.finfo(q.dtype).eps, dtype=q.dtype)
+    tiny = xp.finfo(q.dtype).eps
+    shifts = xp.asarray(shifts * tiny, dtype=q.dtype)
 
     def change(shift):
         of_time = 1 + shift[0]
@@ -160,7 +163,8 @@ def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> State
         return xp.abs(shifted - f)
 
     changes = for_each_row(change, shifts)
-    return xp.max(xp.where(xp.isfinite(changes), changes, 0.0), axis=0)
+    finite = xp.where(xp.isfinite(changes), changes, 0.0)
+    return xp.max(finite, axis=0)
 
 
 def short_step(
@@ -180,10 +184,12 @@ def short_step(
     k2 = field(middle, q + half * f)
     k3 = field(middle, q + half * k2)
     k4 = field(t + h, q + h * k3)
-    slope = (f + 2 * k2 + 2 * k3 + k4) / 6
+    total = f + 2 * k2 + 2 * k3 + k4
+    slope = total / 6
     by_k2 = xp.abs(slope - k2)
     by_k3 = xp.abs(slope - k3)
-    return q + h * slope, h * xp.maximum(by_k2, by_k3)
+    error = h * xp.maximum(by_k2, by_k3)
+    return q + h * slope, error
 
 
 # Relative change at which increments are settled: a few rounding errors. Larger: steps have errors
@@ -210,12 +216,15 @@ class _Decoupled(NamedTuple):
 def _decoupled(method: Method) -> _Decoupled:
     A = np.array(method.a)
     if not np.any(np.triu(A, 1)):
-        return _Decoupled(np.eye(len(A)), A, np.eye(len(A)))
+        unit = np.eye(len(A))
+        return _Decoupled(unit, A, unit)
     values, T = np.linalg.eig(A)
     kept = np.imag(values) >= 0  # one of each conjugate pair, twice
     values = values[kept]
     times = np.where(np.imag(values) > 0, 2, 1)
-    return _Decoupled(T[:, kept] * times, np.diag(values), np.linalg.inv(T)[kept])
+    inverse_rows = np.linalg.inv(T)[kept]
+    scaled = T[:, kept] * times
+    return _Decoupled(scaled, np.diag(values), inverse_rows)
 
 
 def _implicit_step(
@@ -241,7 +250,8 @@ def _implicit_step(
         middle = halfway_cubic(q, end, f0, f1, h)
     else:
         until = _contract(halves.state, w)
-        rate = _contract(halves.rate, w) / jnp.where(h == 0, 1.0, h)
+        positive = jnp.where(h == 0, 1.0, h)
+        rate = _contract(halves.rate, w) / positive
         middle = q + until, rate
     return Step(end, f0, f1, estimate, local, *middle)
 
@@ -268,7 +278,8 @@ def errors(
     of the field at the start.
     """
     plain = _contract(method.error, w)
-    rough = _contract(method.rough or np.zeros(len(method.b)), w)
+    coefficients = method.rough or np.zeros(len(method.b))
+    rough = _contract(coefficients, w)
     estimate = plain
     if method.filter:
         shift = _shifted(J, method.filter * h)
@@ -278,7 +289,8 @@ def errors(
     # takes the place of the step. It has not where a fast mode was excited, by however little, and
     # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
     def divide(x):
-        return jnp.abs(estimate) / jnp.where(x == 0, 1.0, jnp.abs(x))
+        size = jnp.where(x == 0, 1.0, jnp.abs(x))
+        return jnp.abs(estimate) / size
 
     larger = jnp.maximum(divide(rough), 1 - divide(plain))
     ratio = jnp.where(rough == 0, 1.0, larger)
@@ -299,12 +311,14 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
     J = _jacobian(field, t, q)
     c = np.array(method.c)[:, None]
     left, R, right = _decoupled(method)
-    solve = {g: inverse(_shifted(J, g * h)) for g in set(np.diag(R)) if g != 0}
+    factors = set(np.diag(R))
+    solve = {g: inverse(_shifted(J, g * h)) for g in factors if g != 0}
     evaluate = jax.vmap(field)
 
     def correction(w):
         stages = q + _contract(method.a, w)
-        residual = h * evaluate(t + c * h, stages) - w
+        rate = evaluate(t + c * h, stages)
+        residual = h * rate - w
         solved = []
         for i, r in enumerate(_contract(right, residual)):
             # (R is lower triangular: row i needs the rows before, which are solved.)
@@ -320,7 +334,8 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
         change = correction(w)
         w = w + change
         now = jnp.max(jnp.abs(change), axis=0)
-        size = jnp.abs(q) + jnp.max(jnp.abs(w), axis=0)
+        largest_increment = jnp.max(jnp.abs(w), axis=0)
+        size = jnp.abs(q) + largest_increment
         # A component goes on while it moves by more than rounding errors, and converges.
         moves = now > small * size
         converges = (now < 0.5 * last) | (i < 2)
@@ -328,7 +343,8 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
         return w, now, going, i + 1
 
     nothing = jnp.zeros((len(c), *q.shape), q.dtype)
-    w = nothing.at[0].set(h * field(t, q))
+    first = h * field(t, q)
+    w = nothing.at[0].set(first)
     unknown = jnp.full(q.shape, jnp.inf, q.dtype)
     begin = w, unknown, jnp.array(True), 0
 
@@ -381,9 +397,11 @@ class StageEquations(NamedTuple):
         eye = jnp.eye(len(q))[..., None]
         blocks = {}
         for i, j in np.argwhere(A).tolist():
-            blocks[i, j] = -A[i, j] * h * J[i]
+            coupling = -A[i, j] * h
+            blocks[i, j] = coupling * J[i]
         for k in range(len(A)):
-            blocks[k, k] = eye + blocks.get((k, k), 0.0)
+            added = blocks.get((k, k), 0.0)
+            blocks[k, k] = eye + added
         return cls.factored(blocks, len(A))
 
     @classmethod
@@ -403,7 +421,8 @@ class StageEquations(NamedTuple):
                 lower[i, k] = _product(rest[i, k], inverses[k])
                 for j in beside:
                     taken = _product(lower[i, k], rest[k, j])
-                    rest[i, j] = rest.get((i, j), 0.0) - taken
+                    present = rest.get((i, j), 0.0)
+                    rest[i, j] = present - taken
         upper = {(k, j): block for (k, j), block in rest.items() if j > k}
         return cls(inverses=tuple(inverses), lower=lower, upper=upper)
 
@@ -415,7 +434,8 @@ class StageEquations(NamedTuple):
         for k in reversed(range(len(rows))):
             for j in range(k + 1, len(rows)):
                 if (k, j) in self.upper:
-                    rows[k] = rows[k] - _apply(self.upper[k, j], rows[j])
+                    known = _apply(self.upper[k, j], rows[j])
+                    rows[k] = rows[k] - known
             rows[k] = _apply(self.inverses[k], rows[k])
         return jnp.stack(rows)
 
@@ -462,6 +482,7 @@ def inverse(matrix: Inexact[Array, "n n L"]) -> Inexact[Array, "n n L"]:
         is_row = (rows == k)[:, None]
         return jnp.where(is_row, pivot, X - column * pivot)
 
-    eye = jnp.broadcast_to(jnp.eye(n, dtype=matrix.dtype)[..., None], matrix.shape)
+    unit = jnp.eye(n, dtype=matrix.dtype)[..., None]
+    eye = jnp.broadcast_to(unit, matrix.shape)
     X = jnp.concatenate([matrix, eye], axis=1)
     return jax.lax.fori_loop(0, n, eliminate, X)[:, n:]

@@ -91,12 +91,14 @@ class Jump(NamedTuple):
     @property
     def saltation(self) -> Inexact[np.ndarray, "P m n"]:
         """Derivative of the state after the event by that before it, at a fixed time."""
-        return self.by_state + self.slip[..., None] * self.delay_by_state[:, None]
+        by_delay = self.slip[..., None] * self.delay_by_state[:, None]
+        return self.by_state + by_delay
 
     @property
     def input_saltation(self) -> Inexact[np.ndarray, "P m nu"]:
         """The same by the inputs."""
-        return self.by_input + self.slip[..., None] * self.delay_by_input[:, None]
+        by_delay = self.slip[..., None] * self.delay_by_input[:, None]
+        return self.by_input + by_delay
 
 
 def jump(
@@ -119,7 +121,8 @@ def jump(
         first = np.zeros(1, np.int32)
         guard = kernels.watched(s, a, None, *point, first)[row].T
     before = kernels.field(s, a, *point)[:, 0].T
-    reset = np.moveaxis(kernels.reset(s, s.member(g), *point), -1, 0)
+    rows = kernels.reset(s, s.member(g), *point)
+    reset = np.moveaxis(rows, -1, 0)
     after = reset[:, :, 0]
     field_after = kernels.field(s, b, t, after.T, u)[:, 0].T
 

@@ -142,7 +142,8 @@ def size(settings: Settings, a: int, *q: States) -> States:
         most = xp.where(most > 0, most, 1.0)
         return xp.where(largest > 0, largest, most)
     assert settings.rtol is not None
-    usual = settings.scale[a, : len(largest)].reshape(len(largest), -1)
+    scale = settings.scale[a, : len(largest)]
+    usual = scale.reshape(len(largest), -1)
     return largest + settings.atol / settings.rtol * usual
 
 

@@ -118,8 +118,10 @@ class Trajectory(Showable, eqx.Module):
         s = self.structure
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
-            before = s.by_name(s.chart_index(tr.source), self.before[k])
-            after = s.by_name(s.chart_index(tr.target), self.after[k])
+            source = s.chart_index(tr.source)
+            before = s.by_name(source, self.before[k])
+            target = s.chart_index(tr.target)
+            after = s.by_name(target, self.after[k])
             events.append(
                 Event(
                     time=float(self.t[k]),
@@ -139,7 +141,8 @@ class Trajectory(Showable, eqx.Module):
         the same time.
         """
         duration = np.diff(self.t)[:, None, None]
-        part = np.linspace(0.0, 1.0, per_step + 1)[None, :, None]
+        fractions = np.linspace(0.0, 1.0, per_step + 1)
+        part = fractions[None, :, None]
         states = interpolate(
             part,
             duration,
@@ -148,15 +151,20 @@ class Trajectory(Showable, eqx.Module):
             self.slope_after[:-1, None],
             self.slope_before[1:, None],
         )
-        times = self.t[:-1, None] + (duration * part)[..., 0]
-        charts = np.broadcast_to(self.chart[:-1, None], times.shape)
+        since = (duration * part)[..., 0]
+        times = self.t[:-1, None] + since
+        chart_of_step = self.chart[:-1, None]
+        charts = np.broadcast_to(chart_of_step, times.shape)
         # (The start of a step repeats the end of the last one, but for resets.)
         is_new = np.ones(times.shape, bool)
         is_new[1:, 0] = self.event[1:-1] >= 0
-        final_reset = np.flatnonzero(self.event[-1:] >= 0) - 1
+        # (-1, the last row, if the trajectory ends with a reset; else no row.)
+        ends_with_reset = self.event[-1:] >= 0
+        final_reset = np.flatnonzero(ends_with_reset) - 1
         t = np.append(times[is_new], self.t[final_reset])
         chart = np.append(charts[is_new], self.chart[final_reset])
-        return t, chart, np.vstack([states[is_new], self.after[final_reset]])
+        state = np.vstack([states[is_new], self.after[final_reset]])
+        return t, chart, state
 
     def at(
         self, t: Annotated[Numbers, Reals("p")]
@@ -167,17 +175,27 @@ class Trajectory(Showable, eqx.Module):
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """
         t = np.asarray(t)
-        if len(t) and not self.t[0] <= t.min() <= t.max() <= self.t[-1]:
-            raise DefinitionError(
-                f"times must lie between {self.t[0]:.9g} and {self.t[-1]:.9g}."
-            )
+        begin = self.t[0]
+        end = self.t[-1]
+        if len(t) and not begin <= t.min() <= t.max() <= end:
+            raise DefinitionError(f"times must lie between {begin:.9g} and {end:.9g}.")
         k = np.searchsorted(self.t, t, side="right") - 1
         j = np.minimum(k + 1, len(self.t) - 1)
-        h = (self.t[j] - self.t[k])[:, None]
+        duration = (self.t[j] - self.t[k])[:, None]
         since = t[:, None] - self.t[k, None]
-        x = np.divide(since, h, out=np.zeros_like(h), where=h > 0)
-        ends = self.after[k], self.before[j], self.slope_after[k], self.slope_before[j]
-        return self.chart[k], interpolate(x, h, *ends)
+        # (A time at the very end lies in a step without duration.)
+        part = np.divide(
+            since, duration, out=np.zeros_like(duration), where=duration > 0
+        )
+        states = interpolate(
+            part,
+            duration,
+            self.after[k],
+            self.before[j],
+            self.slope_after[k],
+            self.slope_before[j],
+        )
+        return self.chart[k], states
 
     def __call__(self, *names: str, per_step: Count = 32) -> tuple[np.ndarray, ...]:
         """Times and the named states or outputs (at zero input), dense enough to plot.
@@ -210,7 +228,8 @@ class Trajectory(Showable, eqx.Module):
             f"{', '.join(events) or 'no events'}; ends in {s.names[self.chart[-1]]}: "
             f"{self.result.message})"
         )
-        return "\n".join([text, *print_findings(self.findings, "  ").splitlines()])
+        findings = print_findings(self.findings, "  ").splitlines()
+        return "\n".join([text, *findings])
 
 
 def observed(
@@ -226,16 +245,20 @@ def observed(
     """
     require_as_made(s.system, "this trajectory was computed")
     items = tuple(s.resolve_outputs(names).items)
-    values = np.full((len(names), len(t)), np.nan)
+    shape = (len(names), len(t))
+    values = np.full(shape, np.nan)
     for a in np.unique(chart):
         at = chart == a
         states = s.charts[a].states
         if all(item in states for item in items):  # (without compiling a function)
-            values[:, at] = q[at].T[[states.index(item) for item in items]]
+            columns = [states.index(item) for item in items]
+            values[:, at] = q[at].T[columns]
             continue
         u = np.zeros((s.nu, 1))
-        point = t[at], q[at, : s.dims[a]].T, u
-        values[:, at] = kernels.outputs(s, int(a), items, *point)[:, 0]
+        state = q[at, : s.dims[a]].T
+        point = t[at], state, u
+        rows = kernels.outputs(s, int(a), items, *point)
+        values[:, at] = rows[:, 0]
     return values
 
 
@@ -298,7 +321,8 @@ def simulate(
     begin = lane_at(s, start.chart, start.state, start.time, "`state`")
     settings = settings.filled(SIMULATION)
     target = until(begin.t + float(length))
-    path, _ = integrate(s, begin, constant[:, None], target, settings, max_steps)
+    u = constant[:, None]
+    path, _ = integrate(s, begin, u, target, settings, max_steps)
     if throw and path.result != Result.OK:
         raise ComputationError(
             f"the trajectory stopped at t = {path.t[-1]:.6g} in chart '{s.names[path.chart[-1]]}': "
@@ -381,11 +405,13 @@ def recorded(
     """The trajectory of one lane, from the tapes of its pieces, under a constant input (nu, 1), or
     under another one in each piece (nu, pieces)."""
     state = begin.q.T
-    rows = [(begin.t, state, state, begin.chart, np.full(1, -1))]
+    no_event = np.full(1, -1)
+    rows = [(begin.t, state, state, begin.chart, no_event)]
     for tape in tapes:
         lane = jax.tree_util.tree_map(lambda x: np.asarray(x)[..., 0], tape)
         columns = lane.t, lane.before, lane.after, lane.chart, lane.code
-        rows.append(tuple(x[lane.code != IDLE] for x in columns))
+        is_move = lane.code != IDLE
+        rows.append(tuple(x[is_move] for x in columns))
     joined = [np.concatenate(x) for x in zip(*rows, strict=True)]
     t, before, after, chart, event = joined
     source = np.append(chart[:1], chart[:-1])
@@ -395,7 +421,8 @@ def recorded(
         counts = [len(x) for x, *_ in rows[1:]]
         of_step = np.repeat(u, counts, axis=1)
         u_before = np.hstack([of_step[:, :1], of_step])
-        u_after = np.hstack([of_step, of_step[:, -1:]])
+        last = of_step[:, -1:]
+        u_after = np.hstack([of_step, last])
     with at_ease():
         slope_before = slopes(s, t, source, before.T, u_before).T
         slope_after = slopes(s, t, chart, after.T, u_after).T
@@ -469,18 +496,21 @@ def guards_reached(
     rows, flow = _along(s, a, point, u)
     begins = _begin_to_fall(s, a, point, flow, u) if at_rest else np.zeros(len(rows))
     for g, row, begin in zip(guards, rows, begins, strict=True):
-        if not kernels.enabled(s, s.member(g), lane.t, q, u).all():
+        holds = kernels.enabled(s, s.member(g), lane.t, q, u)
+        if not holds.all():
             continue
+        value = float(row[0])
         slope = row[1 : 2 + n]
         noise = _SAME * np.abs(slope * point).sum()
         rate = slope @ flow
-        falls = rate < -_SAME * np.abs(slope * flow).sum()
-        if row[0] < -noise:
-            yield g, float(row[0]), False
-        elif falls and row[0] <= noise - instant * rate:
-            yield g, float(row[0]), True
-        elif begin and row[0] <= noise:
-            yield g, float(row[0]), True
+        noise_of_rate = _SAME * np.abs(slope * flow).sum()
+        falls = rate < -noise_of_rate
+        if value < -noise:
+            yield g, value, False
+        elif falls and value <= noise - instant * rate:
+            yield g, value, True
+        elif begin and value <= noise:
+            yield g, value, True
 
 
 def _along(
@@ -490,8 +520,9 @@ def _along(
     t = point[:1]
     q = point[1:, None]
     first = np.zeros(1, np.int32)
-    rows = kernels.watched(s, a, None, t, q, u, first)[..., 0]
-    return rows, np.append(1.0, kernels.field(s, a, t, q, u)[:, 0, 0])
+    values = kernels.watched(s, a, None, t, q, u, first)
+    field = kernels.field(s, a, t, q, u)
+    return values[..., 0], np.append(1.0, field[:, 0, 0])
 
 
 def _begin_to_fall(
@@ -503,10 +534,12 @@ def _begin_to_fall(
 ) -> Bool[np.ndarray, " g"]:
     """Whether each guard of chart a falls a moment later."""
     speed = np.abs(flow[1:]).max()
-    moment = _MOMENT * (1 + np.abs(point[1:]).max()) / speed if speed else 0.0
+    size = 1 + np.abs(point[1:]).max()
+    moment = _MOMENT * size / speed if speed else 0.0
     rows, flow = _along(s, a, point + moment * flow, u)
     slopes = rows[:, 1 : 1 + len(point)]
-    return slopes @ flow < -_SAME * np.abs(slopes * flow).sum(axis=1)
+    noise = _SAME * np.abs(slopes * flow).sum(axis=1)
+    return slopes @ flow < -noise
 
 
 def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
@@ -520,31 +553,44 @@ def _passed(s: Structure, t, charts, before, after, event, u) -> int | None:
             continue
         n = s.dims[a]
         rows = events[charts[events] == a]
-        sizes = np.abs(after[:, :n]).max(axis=0)
-        state = after[rows, :n].T
-        guard = _guards_at(s, a, t[rows], state, u)
+        magnitude = np.abs(after[:, :n])
+        sizes = magnitude.max(axis=0)
+        # Values of the guards before the event, after it, and at the end of the next step.
         begin = before[rows, :n].T
+        state = after[rows, :n].T
         end = before[rows + 1, :n].T
         value_before = _guards_at(s, a, t[rows], begin, u)[:, 0]
-        value_later = _guards_at(s, a, t[rows + 1], end, u)[:, 0]
+        guard = _guards_at(s, a, t[rows], state, u)
         value = guard[:, 0]
+        later = t[rows + 1]
+        value_later = _guards_at(s, a, later, end, u)[:, 0]
+
+        # Their rates along the field after the event.
         slope = guard[:, 2 : 2 + n]
-        field = kernels.field(s, a, t[rows], state, u)[:, 0]
-        rate = guard[:, 1] + np.einsum("gnk,nk->gk", slope, field)
+        rows_of_field = kernels.field(s, a, t[rows], state, u)
+        field = rows_of_field[:, 0]
+        along = np.einsum("gnk,nk->gk", slope, field)
+        rate = guard[:, 1] + along
+
         # (Zeros are parts of the terms of values and rates.)
-        zero = _SAME * np.einsum("gnk,n->gk", np.abs(slope), sizes)
-        zero_rate = _SAME * np.einsum("gnk,nk->gk", np.abs(slope), np.abs(field))
-        still = np.abs(rate) <= zero_rate
+        steepness = np.abs(slope)
+        zero = _SAME * np.einsum("gnk,n->gk", steepness, sizes)
+        zero_rate = _SAME * np.einsum("gnk,nk->gk", steepness, np.abs(field))
+
+        is_still = np.abs(rate) <= zero_rate
         had_guard = dims[charts[rows - 1]] == n
-        crosses = had_guard & (np.abs(value_before) <= zero) & (~still)
-        through = (np.abs(value) <= zero) & (value_later < 0) & ~crosses
+        was_on_guard = np.abs(value_before) <= zero
+        crosses = had_guard & was_on_guard & ~is_still
+        is_on_guard = np.abs(value) <= zero
+        through = is_on_guard & (value_later < 0) & ~crosses
         passed += rows[through.any(axis=0)].tolist()
     return min(passed, default=None)
 
 
 def _guards_at(s: Structure, a: int, t, q, u):
     """The guards of chart a at some points, with their derivatives."""
-    return kernels.watched(s, a, None, t, q, u, np.zeros(1, np.int32))
+    first = np.zeros(1, np.int32)
+    return kernels.watched(s, a, None, t, q, u, first)
 
 
 @host_first

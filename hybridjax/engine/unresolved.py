@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._core import jax_compat
 from .._core.compilation import kind
@@ -135,23 +135,20 @@ def _passing(
         values = values.reshape(*points.shape[:2], -1)
         seen = values[:, :8, :m]
         rates = values[:, 8:, :m]
+        guards = values[:, 8:, m:]
         beside = rates - samples.polynomial @ seen
         duration = np.diff(path.t)[k, None]
         lacks = duration * np.abs(samples.weights @ beside)
         if linear and len(k) > 1 and not only_poles:
-            gains = rates[:, :, n:]
-            pairs = np.concatenate([gains[:-1], gains[1:]], axis=1)
-            errors = np.abs(np.einsum("pf,kfj->kpj", samples.probes, pairs))
-            error = duration[:-1] * errors.max(axis=1, initial=0.0)
-            follows = np.diff(k)[:, None] == 1
-            error = np.where(follows, error, 0.0)
-            lacks[:-1, n:] = np.maximum(lacks[:-1, n:], error)
+            error = _errors_of_gains(k, rates[:, :, n:], duration, samples.probes)
+            of_gains = lacks[:-1, n:]
+            lacks[:-1, n:] = np.maximum(of_gains, error)
         part = _Part(
             moved=duration * (samples.weights @ np.abs(rates)),
             lacks=lacks,
             beside=np.abs(beside).max(axis=1),
             largest=np.abs(rates).max(axis=1),
-            falls=_falls(values[:, 8:, m:]),
+            falls=_falls(guards),
         )
         parts.append(part)
     whole = _Part(*map(np.concatenate, zip(*parts, strict=True)))
@@ -162,16 +159,40 @@ def _passing(
     else:
         usual = settings.scale[a]
     size = whole.moved.sum(axis=0)
-    size[:n] = np.maximum(size[:n], usual[:n])
+    usual_states = usual[:n]
+    size[:n] = np.maximum(size[:n], usual_states)
     same = np.repeat([_SAME * accuracy, _SAME_GAIN], [n, m - n])
-    wrong = whole.lacks > same * size + ROUNDING * size.max()
+    allowed = same * size + ROUNDING * size.max()
+    wrong = whole.lacks > allowed
     if linear:
         fastest = whole.largest[:, :n].max(axis=0)
-        fastest = np.maximum(fastest, usual[:n] / np.ptp(path.t))
+        usual_rate = usual[:n] / np.ptp(path.t)
+        fastest = np.maximum(fastest, usual_rate)
         # (The root of the accuracy, as at a kink. Less: kinks are refused. More: multipliers are
         # wrong beside steep functions that steps do not resolve.)
-        wrong[:, :n] |= whole.beside[:, :n] > np.sqrt(accuracy) * fastest
+        steep = np.sqrt(accuracy) * fastest
+        is_steep = whole.beside[:, :n] > steep
+        wrong[:, :n] |= is_steep
     return np.concatenate([wrong, whole.falls], axis=1)
+
+
+def _errors_of_gains(
+    k: Int[np.ndarray, " K"],
+    gains: Float[np.ndarray, "K f j"],
+    duration: Float[np.ndarray, "K 1"],
+    probes: Float[np.ndarray, "p f2"],
+) -> Float[np.ndarray, "K-1 j"]:
+    """Errors of the gains by the probes of pairs of steps; 0 where the second step of a pair
+    does not follow on the first.
+
+    **Arguments:** `k`: the rows of the steps.
+    """
+    both = [gains[:-1], gains[1:]]
+    pairs = np.concatenate(both, axis=1)
+    errors = np.abs(np.einsum("pf,kfj->kpj", probes, pairs))
+    error = duration[:-1] * errors.max(axis=1, initial=0.0)
+    follows = np.diff(k)[:, None] == 1
+    return np.where(follows, error, 0.0)
 
 
 class _Samples(NamedTuple):
@@ -195,7 +216,8 @@ def _samples(method: Method, only_poles: bool, linear: bool) -> _Samples:
     legendre = np.polynomial.legendre
     coarse, _ = legendre.leggauss(8)
     inner, weights = legendre.leggauss(4)
-    within_pieces = np.arange(pieces)[:, None] + (inner + 1) / 2
+    number = np.arange(pieces)[:, None]
+    within_pieces = number + (inner + 1) / 2
     fine = 2 * within_pieces.ravel() / pieces - 1
     coefficients = np.linalg.inv(legendre.legvander(coarse, 7))
     of_step = np.tile(weights / 2 / pieces, pieces)
@@ -266,7 +288,8 @@ def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarr
         left = np.clip(left, 0, len(t) - 2)
         right = left + 1
         of_stage = length * np.array(method.b)
-        of_right = of_stage * (stages - t[left]) / (t[right] - t[left])
+        since = stages - t[left]
+        of_right = of_stage * since / (t[right] - t[left])
         of_left = of_stage - of_right
         row = -np.tile(weights, 2) * inside
         np.add.at(row, left, of_left)
@@ -342,18 +365,23 @@ def jumps(
     quarters = np.arange(1, 4)[:, None, None] / 4
 
     def at(points):
-        return values_at(s, a, points, np.zeros(s.nu))[:, :m]
+        no_input = np.zeros(s.nu)
+        return values_at(s, a, points, no_input)[:, :m]
 
     def limits(first):
         """Magnitudes of the field and the gains, relative to which changes are judged."""
-        shifted = low * (1 + 2e-15 * (-1.0) ** np.arange(1 + n))
+        signs = (-1.0) ** np.arange(1 + n)
+        shifted = low * (1 + 2e-15 * signs)
+        changes = np.abs(at(shifted) - first)
         # (A quantile: not the change at a jump.)
-        rounding = np.nanquantile(np.abs(at(shifted) - first), 0.9, axis=0)
+        rounding = np.nanquantile(changes, 0.9, axis=0)
         largest = np.nanmax(np.abs(first), axis=0)
         limit = np.maximum(largest, rounding / _JUMP)
-        limit[:n] = np.maximum(limit[:n], sizes[1:] / sizes[0])
+        rate_of_size = sizes[1:] / sizes[0]
+        limit[:n] = np.maximum(limit[:n], rate_of_size)
         largest_gain = limit[n:].max(initial=0.0)
-        limit[n:] = np.maximum(limit[n:], _SAME_GAIN * largest_gain)
+        least = _SAME_GAIN * largest_gain
+        limit[n:] = np.maximum(limit[n:], least)
         limit[n:] += np.finfo(float).tiny
         return limit
 
@@ -363,13 +391,15 @@ def jumps(
     for _ in range(_QUARTERS):
         between = low + quarters * (high - low)
         points = np.stack([low, *between, high])
-        inside = at(np.concatenate(between)).reshape(3, *first.shape)
+        inside = at(np.concatenate(between))
+        inside = inside.reshape(3, *first.shape)
         values = np.nan_to_num(np.stack([first, *inside, last]))
         changes = np.diff(values, axis=0)
         change = np.abs(changes) / limit
         lengths = np.abs(np.diff(points, axis=0) / sizes)
         distance = lengths.max(axis=2, keepdims=True)
-        uneven = np.abs(changes - changes.mean(axis=0)) / limit
+        usual = changes.mean(axis=0)
+        uneven = np.abs(changes - usual) / limit
         # The quarter of each interval in which the field changes most unlike in the others.
         worst = uneven.max(axis=2).argmax(axis=0)
         here = np.arange(len(low))
@@ -377,14 +407,18 @@ def jumps(
         high = points[worst + 1, here]
         first = values[worst, here]
         last = values[worst + 1, here]
-        is_jump = (change > _JUMP) & (change > _STEEP * distance)
+        is_steep = change > _STEEP * distance
+        is_jump = (change > _JUMP) & is_steep
         for i, j in np.argwhere(is_jump[worst, here]):
             largest_change = change[worst[i], i, j] * limit[j]
             yield low[i, 0], j, largest_change
         keep = uneven.max(axis=(0, 2)) > _JUMP
-        low, high, first, last = (x[keep] for x in (low, high, first, last))
         if not keep.any():
             return
+        low = low[keep]
+        high = high[keep]
+        first = first[keep]
+        last = last[keep]
 
 
 def has_kinks(s: Structure) -> bool:

@@ -223,7 +223,9 @@ def watch(
         flow = chart_flow(s, a, here, u, target)
         if not flow.rows:
             return out
-        point = only(here, t), only(here, q[: s.dims[a]])
+        time = only(here, t)
+        state = only(here, q[: s.dims[a]])
+        point = time, state
         watched = flow.watch(*point, flow.field(*point))
         return write(out, flow.rows, here, watched)
 

@@ -148,7 +148,8 @@ def _starts_around(
 ) -> Float[np.ndarray, "guesses p"]:
     """Coordinates from which fits begin: the first ones, and random ones around them."""
     rng = np.random.default_rng(seed)
-    around = _SPREAD * rng.uniform(-1, 1, (guesses - 1, len(x0)))
+    draws = rng.uniform(-1, 1, (guesses - 1, len(x0)))
+    around = _SPREAD * draws
     return np.concatenate([x0[None], x0 + around])
 
 
@@ -351,7 +352,8 @@ def _descend(
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
     x, r, J, near, steps, converged = descend(problem, start, cycle, model)
     result = Result.OK if converged else Result.NOT_CONVERGED
-    return End(start, x, float(r @ r), r, J, near, steps, int(result))
+    cost = float(r @ r)
+    return End(start, x, cost, r, J, near, steps, int(result))
 
 
 def _summary(
@@ -402,7 +404,8 @@ def _of_end(
     rank = identified.rank
     dof = len(best.residuals) - rank
     left, singular, _ = np.linalg.svd(sensitivity.T, full_matrices=False)
-    root = left[:, :rank] / singular[:rank] * size[:, None]
+    scaled = left[:, :rank] / singular[:rank]
+    root = scaled * size[:, None]
     return ModelFit(
         system=fitted,
         cycle=cycle,

@@ -199,10 +199,12 @@ class ObservedSeries(AbstractObservation):
         self.inputs = data.inputs
         self.outputs = data.outputs
         y = data.y[data.ok]
-        self.scale = _scale("outputs", std, jnp.asarray(y.reshape(-1, y.shape[2])))
+        rows = jnp.asarray(y.reshape(-1, y.shape[2]))
+        self.scale = _scale("outputs", std, rows)
         self.weighted = jnp.asarray(std is not None)
         noise = 0.0 if std is None else 3.0 * np.asarray(std)
-        most = np.maximum(np.sqrt((y**2).mean(axis=(0, 1))) / 2, noise)
+        rms = np.sqrt((y**2).mean(axis=(0, 1)))
+        most = np.maximum(rms / 2, noise)
         if ((y[:, 0] / most) ** 2).mean() > 1:
             raise DefinitionError(
                 "the experiments do not begin on the cycle: their outputs deviate as much at "
@@ -210,7 +212,8 @@ class ObservedSeries(AbstractObservation):
             )
         self.absolute = data.cycle_outputs is not None
         if data.cycle_outputs is not None:
-            y = y + np.tile(data.cycle_outputs, (y.shape[1] // data.n_sections, 1))
+            periods = y.shape[1] // data.n_sections
+            y = y + np.tile(data.cycle_outputs, (periods, 1))
         self.u = jnp.asarray(data.u[data.ok])
         self.y = jnp.asarray(y)
         self.flow = None

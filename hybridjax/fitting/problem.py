@@ -121,7 +121,9 @@ class Parameters(eqx.Module):
     def _bounds(self) -> tuple[Array, Array, list[Array]]:
         """Return bounds with zero for infinity; the cases of both, a lower one, an upper one."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
-        finite = jnp.where(low, self.low, 0.0), jnp.where(high, self.high, 0.0)
+        lowest = jnp.where(low, self.low, 0.0)
+        highest = jnp.where(high, self.high, 0.0)
+        finite = lowest, highest
         return *finite, [low & high, low, high]
 
 
@@ -176,7 +178,9 @@ def free_parameters(
         if AT_START in name:
             bounds = -jnp.inf, jnp.inf
         if bounds is None:  # it keeps its sign
-            bounds = (0.0 if value > 0 else -jnp.inf, 0.0 if value < 0 else jnp.inf)
+            lowest = 0.0 if value > 0 else -jnp.inf
+            highest = 0.0 if value < 0 else jnp.inf
+            bounds = (lowest, highest)
         if not bounds[0] < value < bounds[1]:
             raise DefinitionError(
                 f"the bounds of '{name}', {bounds[0]:g} and {bounds[1]:g}, must enclose the value "
@@ -307,7 +311,8 @@ def _transient(problem: TransientProblem, x: Float[Array, " p"]) -> tuple[Array,
 @jax.jit
 def _joined(parts, result):
     r = jnp.concatenate(parts)
-    return jnp.where((result == Result.OK) & jnp.isfinite(r).all(), r, jnp.inf)
+    is_finite = jnp.isfinite(r).all()
+    return jnp.where((result == Result.OK) & is_finite, r, jnp.inf)
 
 
 def _with_jacobian(problem: FitProblem, x, guess):
@@ -315,7 +320,8 @@ def _with_jacobian(problem: FitProblem, x, guess):
     and the anchor, the period and the last turn."""
     at = lambda x: problem.residuals(x, guess)  # noqa: E731
     push = lambda t: jax.jvp(at, (x,), (t,), has_aux=True)  # noqa: E731
-    return jax.vmap(push, out_axes=(None, -1, None))(np.eye(x.shape[0]))
+    along = jax.vmap(push, out_axes=(None, -1, None))
+    return along(np.eye(x.shape[0]))
 
 
 _compiled = quick_jit(_with_jacobian)
@@ -366,8 +372,10 @@ def descend(
     def step(damping):
         largest = np.linalg.norm(J, 2)
         size = largest if largest > _RCOND else 1.0  # (rounding is no sensitivity)
-        damped = np.concatenate([J, np.sqrt(damping) * size * np.eye(len(x))])
-        return np.linalg.lstsq(damped, np.append(r, np.zeros(len(x))), rcond=_RCOND)[0]
+        penalty = np.sqrt(damping) * size * np.eye(len(x))
+        damped = np.concatenate([J, penalty])
+        goal = np.append(r, np.zeros(len(x)))
+        return np.linalg.lstsq(damped, goal, rcond=_RCOND)[0]
 
     while steps < MAX_STEPS and np.isfinite(r).all() and np.isfinite(J).all():
         trial, steps = x - step(damping), steps + 1
@@ -384,9 +392,11 @@ def descend(
         if done:
             # (Steps become short, too, where none helps: beside parameters without a cycle.)
             gain = r @ J @ step(_RCOND**2)
-            return x, r, J, near, steps, bool(gain <= _TOLERANCE * (1 + r @ r))
+            converged = bool(gain <= _TOLERANCE * (1 + r @ r))
+            return x, r, J, near, steps, converged
     return x, r, J, near, steps, False
 
 
 def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:
-    return bool(np.all(np.abs(change) < _TOLERANCE * (1 + np.abs(x))))
+    allowed = _TOLERANCE * (1 + np.abs(x))
+    return bool(np.all(np.abs(change) < allowed))

@@ -161,7 +161,8 @@ def residuals_of(
         count = jnp.cumsum(is_own)
         number = jnp.arange(1, len(measured) + 1)
         row = jnp.argmax(count == number[:, None], axis=1)
-        time = jnp.where(count[-1] >= number, found.event_times[row], jnp.nan)
+        has_come = count[-1] >= number
+        time = jnp.where(has_come, found.event_times[row], jnp.nan)
         parts.append((time - measured) / observation.event_scale)
     return jnp.concatenate(parts)
 
@@ -256,11 +257,15 @@ def _event_times(name: str, times: Any) -> Float[np.ndarray, " E"]:
 def _require_times(start: Guess, *lists: np.ndarray) -> None:
     """**Raises:** `DefinitionError` for times that do not increase, or come before the start."""
     for times in lists:
-        if len(times) and not (np.diff(times, prepend=float(start.time) - 1) > 0).all():
+        if not len(times):
+            continue
+        begin = float(start.time)
+        steps = np.diff(times, prepend=begin - 1)
+        if not (steps > 0).all():
             raise DefinitionError("times of a trajectory must increase.")
-        if len(times) and times[0] < float(start.time):
+        if times[0] < begin:
             raise DefinitionError(
-                f"a time, {times[0]:.6g}, comes before the start at {float(start.time):.6g}."
+                f"a time, {times[0]:.6g}, comes before the start at {begin:.6g}."
             )
 
 

@@ -70,7 +70,8 @@ def cramer_rao(
         return _with_matrices(model, exact)
     multipliers = model.multipliers
     c = coefficients_of(multipliers)
-    _, J = varpro.residuals_of(varpro.grouped(exact, len(c), extra_lags), c)
+    groups = varpro.grouped(exact, len(c), extra_lags)
+    _, J = varpro.residuals_of(groups, c)
     return MultiplierEstimate(multipliers, c, np.linalg.inv(J.T @ J), np.inf)
 
 

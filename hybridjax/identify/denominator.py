@@ -41,7 +41,8 @@ def divided_by_chi(
 ) -> Complex[np.ndarray, "*d M F ny nu"]:
     r"""Return $\sum_r b_m[r] z^{-r} / \chi(z^{-N})$ at frequencies f, with r from -lead on."""
     delay = np.exp(-2j * np.pi / N * f)
-    powers = delay[:, None] ** (np.arange(numerators.shape[-3]) - lead)
+    exponents = np.arange(numerators.shape[-3]) - lead
+    powers = delay[:, None] ** exponents
     values = np.einsum("fr,...mrij->...mfij", powers, numerators)
     return values / chi(delay**N, c)[:, None, None]
 
@@ -56,7 +57,8 @@ def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     roots = np.roots([1.0, *coefficients]).astype(complex)
     at_zero = len(coefficients) - len(roots)  # numpy drops these
     roots = np.pad(roots, (0, at_zero))
-    order = np.lexsort((-np.imag(roots), -np.abs(roots)))
+    by_modulus = -np.abs(roots)
+    order = np.lexsort((-np.imag(roots), by_modulus))
     return roots[order]
 
 
@@ -110,7 +112,8 @@ def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> in
 def fading(c: Coefficients) -> Coefficients:
     """Return the coefficients of chi, with multipliers moved to a modulus of at most 0.99."""
     slowest = np.abs(np.roots([1.0, *c])).max(initial=SLOWEST)
-    return c * (SLOWEST / slowest) ** np.arange(1, len(c) + 1)
+    powers = np.arange(1, len(c) + 1)
+    return c * (SLOWEST / slowest) ** powers
 
 
 def in_blocks(

@@ -80,7 +80,8 @@ def least_squares(
             return c, True
         unit = np.sqrt(cost)
         _, size, combinations = np.linalg.svd(jacobian, full_matrices=False)
-        to_c = unit * combinations.T / np.maximum(size, ROUNDING * size[0])
+        visible = np.maximum(size, ROUNDING * size[0])
+        to_c = unit * combinations.T / visible
         end = optimize.least_squares(
             lambda x: at(c + to_c @ x)[0] / unit,  # noqa: B023
             np.zeros(to_c.shape[1]),

@@ -161,7 +161,8 @@ def _small_design(
     gain = np.sqrt(power.mean(axis=0))
     orbit = cycle.trajectory()
     values = observed(orbit.structure, outputs, *orbit.dense(_PER_STEP))
-    reach = np.array([np.nanmax(x) - np.nanmin(x) for x in values]) / 2
+    ranges = [np.nanmax(x) - np.nanmin(x) for x in values]
+    reach = np.array(ranges) / 2
     moves = (reach > 0) & (gain > 0)
     if not moves.any():
         raise DefinitionError(

@@ -188,7 +188,8 @@ def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstima
         solution = np.einsum("kij,kjml->kiml", inverse, right)
         explained = np.einsum("kiml,kiml->kml", solution.conj(), right).real
         H[entries] = solution[:, :nu]
-        spread[entries] = np.real(np.linalg.diagonal(inverse))[:, :nu]
+        variances = np.real(np.linalg.diagonal(inverse))
+        spread[entries] = variances[:, :nu]
         residual[entries] = np.maximum(sums.energy[lines] - explained, 0)
 
     def variance(square):
@@ -249,8 +250,10 @@ def roundness(
     """
     shaped = (count > 2) & (square > 0)
     part = np.divide(np.abs(turned), square, out=np.zeros_like(square), where=shaped)
-    mean = np.where(count > 2, 1 - 2 / np.maximum(count, 1), 1)
-    return np.where(shaped, (1 - np.minimum(part, 1) ** 2) / mean, 1.0)
+    expected = 1 - 2 / np.maximum(count, 1)
+    mean = np.where(count > 2, expected, 1)
+    found = (1 - np.minimum(part, 1) ** 2) / mean
+    return np.where(shaped, found, 1.0)
 
 
 def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:

@@ -144,8 +144,10 @@ def spectral_products(
     else:
         unit = like.unit
     classes = np.arange(P // 2 + 1)
-    bins = (classes[:, None] + P * np.arange(N)) % (N * P)
-    windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in data.windows(repeats)]
+    harmonics = P * np.arange(N)
+    bins = (classes[:, None] + harmonics) % (N * P)
+    blocks = data.windows(repeats)
+    windows = [np.fft.fft(z[:, w] / unit, axis=1) for w in blocks]
     spectra = np.stack(windows)[:, :, bins]
     # (windows, S, K, N, signals) to (windows, K, N * signals, S), components first
     spectra = np.moveaxis(spectra, 1, 4)
@@ -202,7 +204,8 @@ def excited_classes(
     size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
-    relative = power / scale[:, :, None] / scale[:, None]
+    by_column = power / scale[:, :, None]
+    relative = by_column / scale[:, None]
     least = np.linalg.eigvalsh(relative)[:, 0]
     whole = strong.all(axis=1) & (least > SILENT_LINE)
     if whole.any():
@@ -237,8 +240,10 @@ def solve(
     classes = excited_classes(sums, r, threshold)
     estimates = _solve_classes(sums, classes, (y, u, r), how)
     every = (classes[:, None] + P * np.arange(N)) / P
-    nearest = np.abs((every + N / 2) % N - N / 2)
-    f = np.unique(np.round(P * nearest).astype(int)) / P
+    shifted = (every + N / 2) % N
+    nearest = np.abs(shifted - N / 2)
+    bins = np.round(P * nearest).astype(int)
+    f = np.unique(bins) / P
     lines = Lines.of(f, N)
 
     def entries(x):
@@ -336,7 +341,8 @@ def _solve_classes(
     left = spread @ block(u, u) - np.eye(len(u))
     edge = _diagonal(left @ spread) / by_input
     counted = dof + _diagonal(left).sum(axis=1)
-    total = variance(G, counted[:, None, None] + 2 * edge[:, None])
+    twice = counted[:, None, None] + 2 * edge[:, None]
+    total = variance(G, twice)
     taken = _diagonal(left @ left).sum(axis=1) / counted**2
     return _ClassEstimates(
         H=H,

@@ -152,5 +152,6 @@ def _without(sums: Sums, rows: np.ndarray) -> Sums:
     total = sums.total
     power = total[:, rows[:, None], rows]
     inverse = np.linalg.pinv(power, hermitian=True)
-    left = total[:, :, rows] @ inverse @ total[:, rows]
+    explained = total[:, :, rows] @ inverse
+    left = explained @ total[:, rows]
     return sums._replace(total=total - left, experiments=sums.experiments - len(rows))

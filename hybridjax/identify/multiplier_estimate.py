@@ -124,7 +124,8 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     truth = multipliers_from(true)
     if values.size == 0 or truth.size == 0:
         raise DefinitionError("`true` or the estimate holds no multiplier to compare.")
-    rows, columns = linear_sum_assignment(np.abs(values[:, None] - truth))
+    distances = np.abs(values[:, None] - truth)
+    rows, columns = linear_sum_assignment(distances)
     paired_values = values[rows]
     paired_truth = truth[columns]
     order = np.lexsort((-np.imag(paired_truth), -np.abs(paired_truth)))
@@ -189,7 +190,8 @@ class MultiplierFit(Fit):
         if not np.isfinite(self.covariance).all():
             return modulus, np.full(len(modulus), np.inf)
         along = self.multipliers / positive(modulus)
-        outward = np.stack([along.real, along.imag], axis=1)[:, :, None]
+        parts = np.stack([along.real, along.imag], axis=1)
+        outward = parts[:, :, None]
         with np.errstate(all="ignore"):
             variance = outward.mT @ self.multiplier_covariances @ outward
         return modulus, np.sqrt(variance[:, 0, 0])
@@ -369,7 +371,8 @@ class MultiplierFit(Fit):
                 continue
             # (As many digits as the interval leaves.)
             width = max(bounds[1] - bounds[0], 1e-12)
-            digits = max(2, int(np.ceil(-np.log10(width / 2))))
+            magnitude = -np.log10(width / 2)
+            digits = max(2, int(np.ceil(magnitude)))
             low, high = np.maximum(bounds, 0.0)
             shown.append(
                 f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
@@ -488,7 +491,8 @@ def left_out(higher: Callable[[], RoughFit]) -> list[Finding]:
     with suppress(DefinitionError):
         coefficients, covariance = higher()
         matrix, dof = covariance()
-        distance = float(coefficients[-1] ** 2 / matrix[-1, -1])
+        last = coefficients[-1] ** 2
+        distance = float(last / matrix[-1, -1])
         if _tail(distance, 1, dof) < _NEEDED:
             order = len(coefficients)
             text = (

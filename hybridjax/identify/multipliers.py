@@ -300,7 +300,9 @@ class OrderSelection(Showable, eqx.Module):
     @property
     def by_rank(self) -> int:
         small = self.deviation <= self.threshold
-        return int(np.argmax(small)) if small.any() else int(self.orders[-1])
+        if small.any():
+            return int(np.argmax(small))
+        return int(self.orders[-1])
 
     @property
     def by_mdl(self) -> int:
@@ -356,7 +358,8 @@ def compare_orders(htf: HTF, max_order: int, extra_lags: int | None) -> OrderSel
         likelihood = data * np.log(np.maximum(cost, 1e-300))
     else:
         most = weights.largest_misfit(htf)
-        level, _ = weights.estimated_noise(most, cost[-1] / dof[-1])
+        usual = cost[-1] / dof[-1]
+        level, _ = weights.estimated_noise(most, usual)
         likelihood = cost / level
     exact = bool(noise.max() < ROUNDING)
     values, spread = noise_ratios(largest, htf, c, exact)
@@ -415,7 +418,8 @@ def noise_ratios(
     cost, dof = varpro.cost_of(groups, c)
     level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / dof)
     whitened, _ = varpro.delayed_responses(groups, np.zeros(len(c)))
-    values = np.linalg.svd(whitened, compute_uv=False)[::-1] ** 2 / level
+    singular_values = np.linalg.svd(whitened, compute_uv=False)
+    values = singular_values[::-1] ** 2 / level
     if exact:
         values = values / _ROUNDING_VARIES
     return values, tails * float(np.sqrt(2 / dof))

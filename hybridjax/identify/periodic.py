@@ -212,7 +212,8 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
     N = model.n_sections
     largest = max(model.of_errors.radius, _LARGEST_MODULUS)
     rho = (_LARGEST_MODULUS / largest) ** (1 / N)
-    pairs = [_root(n, P) for n, P in enumerate(_gramians(model.of_errors, rho))]
+    gramians = _gramians(model.of_errors, rho)
+    pairs = [_root(n, P) for n, P in enumerate(gramians)]
     roots, back = zip(*pairs, strict=True)
     after = (*roots[1:], roots[0])
     normal = PeriodicModel(
@@ -229,7 +230,8 @@ def local_coordinates(model: PeriodicModel, direct: bool) -> LocalCoordinates:
         columns = np.concatenate([rho * F, C])
         orthogonal = np.linalg.qr(columns, mode="complete")[0][:, d:]
         to_C.append(orthogonal[states:])
-        to_A.append(orthogonal[:states] / rho + K @ orthogonal[states:])
+        by_error = K @ orthogonal[states:]
+        to_A.append(orthogonal[:states] / rho + by_error)
     return LocalCoordinates(
         model=normal,
         to_A=to_A,
@@ -244,7 +246,8 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
     def around(P: Float[np.ndarray, "d d"]) -> Blocks:
         out = []
         for A, C in zip(reversed(model.A), reversed(model.C), strict=True):
-            P = C.T @ C + rho**2 * A.T @ P @ A
+            later = rho**2 * A.T @ P @ A
+            P = C.T @ C + later
             out.append(P)
         return out[::-1]
 

@@ -238,11 +238,13 @@ def _fit_one(
         raise DefinitionError(
             f"{name} holds NaN or infinity: leave these frequencies out."
         )
-    rms = float(np.sqrt(np.mean(np.abs(h) ** 2)))
+    power = np.mean(np.abs(h) ** 2)
+    rms = float(np.sqrt(power))
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
     exponents = 1 + np.arange(zeros + 1)
-    powers = np.exp(-2j * np.pi * f[:, None] * exponents)
+    angles = -2j * np.pi * f[:, None] * exponents
+    powers = np.exp(angles)
     response = FittedResponse(
         harmonic=(0, -1),
         share=1.0,
@@ -250,7 +252,8 @@ def _fit_one(
         values=h / rms,
         weight=np.full(len(h), len(h) ** -0.5),
     )
-    (group,) = equal_weights(f, np.arange(len(f)), zeros + 1, powers, [response])
+    lines = np.arange(len(f))
+    (group,) = equal_weights(f, lines, zeros + 1, powers, [response])
     linearize = functools.partial(residuals_of, [group])
     ends = []
     with np.errstate(all="ignore"):
@@ -279,7 +282,8 @@ def _fit_one(
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
-    finite = finite[np.lexsort((-np.imag(finite), -np.abs(finite)))]
+    order = np.lexsort((-np.imag(finite), -np.abs(finite)))
+    finite = finite[order]
     infinite = len(coefficients) - 1 - len(finite)
     return np.concatenate([np.full(infinite, np.nan), finite])
 
@@ -289,6 +293,7 @@ def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
         columns, _ = late_columns(group, a)
-        a, *_ = np.linalg.lstsq(columns[:, 1:], -columns[:, 0])
+        first = -columns[:, 0]
+        a, *_ = np.linalg.lstsq(columns[:, 1:], first)
         if step in _STARTS:
             yield a

@@ -117,7 +117,8 @@ def ranges(
     bases = []
     for n, matrix in enumerate(matrices):
         left, size, _ = np.linalg.svd(matrix, full_matrices=False)
-        rank = int((size > max(edge, ROUNDING * size[0])).sum())
+        smallest = max(edge, ROUNDING * size[0])
+        rank = int((size > smallest).sum())
         d = max(order, rank, 1) if dims is None else dims[n]
         if d > most:
             raise DefinitionError(

@@ -160,7 +160,8 @@ def _sums_of_part(
 
     def total(values):
         """Sums over the entries of each line."""
-        out = np.zeros((len(lines), *values.shape[1:]), values.dtype)
+        shape = (len(lines), *values.shape[1:])
+        out = np.zeros(shape, values.dtype)
         np.add.at(out, index[good], values[good])
         return out
 
@@ -168,7 +169,8 @@ def _sums_of_part(
     products = X[:, :, None].conj() * X[:, None]
     Y, noise = _outputs(data, windows, experiment, line, harmonics)
     size = np.abs(U)
-    phase = np.divide(U.conj(), size, out=np.zeros_like(U), where=size > 0)
+    none = np.zeros_like(U)
+    phase = np.divide(U.conj(), size, out=none, where=size > 0)
     turned = phase[:, :, None, None] * Y[:, None]
     tested = (0, 0)
     if first or len(lines) < len(line):  # lines were measured several times
@@ -196,22 +198,27 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
     """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
     N = data.n_sections
     P = data.periods
-    output = (line[:, None] + P * np.asarray(harmonics, int)) % (N * P)
+    shifts = P * np.asarray(harmonics, int)
+    output = (line[:, None] + shifts) % (N * P)
     spectra = [np.fft.fft(data.y[:, window], axis=1) for window in windows]
     Y = np.stack([x[experiment[:, None], output] for x in spectra])
     mean = Y.sum(axis=0) / len(Y)
     square = (np.abs(Y - mean) ** 2).sum(axis=0)
-    return mean, square / max(len(Y) - 1, 1) / len(Y)
+    degrees = max(len(Y) - 1, 1)
+    return mean, square / degrees / len(Y)
 
 
 def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):
     """Return experiment, line and U of every excited line, checked that they do not meet."""
     known = np.isfinite(data.u).all(axis=(1, 2), keepdims=True)
     u = np.where(known, data.u, 0.0)
-    spectra = np.stack([np.fft.rfft(u[:, window], axis=1) for window in windows])
+    in_windows = [np.fft.rfft(u[:, window], axis=1) for window in windows]
+    spectra = np.stack(in_windows)
     U = spectra.sum(axis=0) / len(spectra)
     # Inputs have units of their own.
-    unit = np.maximum(np.abs(U).max(axis=(0, 1)), np.finfo(float).tiny)
+    largest = np.abs(U).max(axis=(0, 1))
+    tiny = np.finfo(float).tiny
+    unit = np.maximum(largest, tiny)
     size = np.abs(U) / unit
     peak = size.max(axis=(1, 2), keepdims=True)
     change = np.abs(spectra - U) / unit / positive(peak)
@@ -235,8 +242,10 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
     rms, about 3 for random phases) do not. Return the numbers of signals that were tested, and of
     those with crest factors below all redraws.
     """
-    chosen = np.unique(np.linspace(0, len(u) - 1, _TESTED).round().astype(int))
-    signals = u[chosen].transpose(0, 2, 1).reshape(-1, u.shape[1])
+    places = np.linspace(0, len(u) - 1, _TESTED).round()
+    chosen = np.unique(places.astype(int))
+    by_input = u[chosen].transpose(0, 2, 1)
+    signals = by_input.reshape(-1, u.shape[1])
     rng = np.random.default_rng(0)
     tested = 0
     low = 0
@@ -247,8 +256,10 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
             continue
         angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))
         spectra = np.zeros((_REDRAWS, len(size)), complex)
-        spectra[:, lines] = size[lines] * np.exp(1j * angle)
-        draws = np.abs(np.fft.irfft(spectra, len(signal), axis=1)).max(axis=1)
+        turns = np.exp(1j * angle)
+        spectra[:, lines] = size[lines] * turns
+        waves = np.fft.irfft(spectra, len(signal), axis=1)
+        draws = np.abs(waves).max(axis=1)
         tested += 1
         low += bool(np.abs(signal).max() < draws.min())
     return tested, low
@@ -264,9 +275,11 @@ def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
         x = getattr(a, name)
         y = getattr(b, name)
         if isinstance(x, tuple):
-            both[name] = (x[0] + y[0], x[1] + y[1])
+            total = x[0] + y[0]
+            both[name] = (total, x[1] + y[1])
             continue
-        both[name] = np.zeros((len(line), *x.shape[1:]), x.dtype)
+        shape = (len(line), *x.shape[1:])
+        both[name] = np.zeros(shape, x.dtype)
         both[name][rows_a] += x
         both[name][rows_b] += y
     return a._replace(line=line, **both)

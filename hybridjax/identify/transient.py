@@ -51,7 +51,8 @@ class TransientFit(Showable, eqx.Module):
 
     def __repr__(self) -> str:
         shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
-        size = ", ".join(f"{x:.2g}" for x in np.nanmax(self.removed, axis=0))
+        sizes = np.nanmax(self.removed, axis=0)
+        size = ", ".join(f"{x:.2g}" for x in sizes)
         return folded(
             f"TransientFit(multipliers {shown}; removed rms up to {size}; {self.data!r})"
         )
@@ -184,7 +185,8 @@ def _require_repetition(data: ExperimentData, u: Float[np.ndarray, "S n nu"]) ->
     """**Raises:** `DefinitionError` for an input that does not repeat after P periods."""
     length = data.n_sections * data.periods
     later = u[:, length:]
-    change = np.abs(later - u[:, :-length]).max(axis=(1, 2))
+    earlier = u[:, :-length]
+    change = np.abs(later - earlier).max(axis=(1, 2))
     worst = int(np.argmax(change))
     if change[worst] > SILENT_LINE * np.abs(u[worst]).max():
         raise DefinitionError(
@@ -218,7 +220,8 @@ def _decay(c: Coefficients, cycles: int) -> Float[np.ndarray, "cycles d"]:
 
 def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows cycles"]:
     """Return rows that are orthogonal to the sinusoids of these classes at one section."""
-    angle = 2 * np.pi / P * np.outer(np.arange(cycles), classes)
+    products = np.outer(np.arange(cycles), classes)
+    angle = 2 * np.pi / P * products
     inner = (classes > 0) & (2 * classes < P)
     cosines = np.cos(angle)
     sines = np.sin(angle[:, inner])

@@ -149,18 +149,21 @@ class Validation(Showable, eqx.Module):
     @property
     def white(self) -> bool:
         """True if the residuals of all outputs may be white."""
-        return bool(np.min(self.whiteness) >= self.alpha / len(self.outputs))
+        threshold = self.alpha / len(self.outputs)
+        return bool(np.min(self.whiteness) >= threshold)
 
     @property
     def independent(self) -> bool:
         """True if the residuals of all outputs may be independent of the inputs."""
-        return bool(np.min(self.independence) >= self.alpha / len(self.outputs))
+        threshold = self.alpha / len(self.outputs)
+        return bool(np.min(self.independence) >= threshold)
 
     @property
     def unexplained(self) -> tuple[str, ...]:
         """Outputs that the model predicts no better, beyond chance, than their mean cycle does."""
         pairs = zip(self.outputs, self.no_better, strict=True)
-        return tuple(name for name, p in pairs if p > self.alpha / len(self.outputs))
+        threshold = self.alpha / len(self.outputs)
+        return tuple(name for name, p in pairs if p > threshold)
 
     def __repr__(self) -> str:
         names = [listed([name]) for name in self.outputs]
@@ -196,7 +199,8 @@ class Validation(Showable, eqx.Module):
 
     def _repr_html_(self) -> str:
         k = slice(0, _DRAWN * self.n_sections)
-        t = (self.first_section + np.arange(len(self.measured[k]))) / self.n_sections
+        sections = self.first_section + np.arange(len(self.measured[k]))
+        t = sections / self.n_sections
         curves = [
             Curve(t, self.measured[k, 0], "measured", COLORS[-1]),
             Curve(t, self.simulated[k, 0], "simulated"),
@@ -293,7 +297,8 @@ def validate(
         roots = list(model.spread(grid))
     if isinstance(tested, LDTP):
         # Outputs in units of their size, so that none is neglected.
-        S = np.tile(np.diag(prepared.scale**2), (N, 1, 1))
+        of_section = np.diag(prepared.scale**2)
+        S = np.tile(of_section, (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
     y = np.where(grid.sampled, grid.y, np.nan)
     with np.errstate(all="ignore"):
@@ -308,11 +313,17 @@ def validate(
                 "the simulation of an unstable plant grows without bound: validate "
                 "`fit_ldtp(series)`."
             )
-    rms = np.sqrt(np.nanmean(error**2, axis=(0, 1, 2)))
-    size = np.sqrt(np.mean(simulated[grid.inside] ** 2, axis=0))
+    square = np.nanmean(error**2, axis=(0, 1, 2))
+    rms = np.sqrt(square)
+    square_of_outputs = np.mean(simulated[grid.inside] ** 2, axis=0)
+    size = np.sqrt(square_of_outputs)
+
     autocorrelation, whiteness = whiteness_test(whitened(error, roots), lags)
-    late = np.where((grid.age >= lags)[..., None], error, np.nan)
-    inputs = CycleGrid.from_records(list(itertools.compress(outside, kept))).u
+    # (Inputs of so many lags are known from here on.)
+    is_late = (grid.age >= lags)[..., None]
+    late = np.where(is_late, error, np.nan)
+    driving = list(itertools.compress(outside, kept))
+    inputs = CycleGrid.from_records(driving).u
     cross_correlation, independence, visible = independence_test(
         inputs, late, lags, alpha / ny, roots
     )
@@ -322,8 +333,9 @@ def validate(
     # Inputs after the last samples are unknown.
     shown = slice(first, first + len(longest.u) - longest.lead)
     share = visible * rms / positive(size)
+    unexplained = rms / np.nanstd(y, axis=(0, 1, 2))
     return Validation(
-        fit=100 * (1 - rms / np.nanstd(y, axis=(0, 1, 2))),
+        fit=100 * (1 - unexplained),
         noise=rms,
         no_better=no_better,
         whiteness=np.maximum(whiteness, rounding),
@@ -406,7 +418,8 @@ def _lags(prepared: PreparedRecords, grid: CycleGrid) -> int:
 
     def count(lags: int) -> Int[np.ndarray, "N ny"]:
         """Return how often each section was sampled with so many samples before it."""
-        return (grid.sampled & (grid.age > lags)[..., None]).sum(axis=(0, 1))
+        is_late = (grid.age > lags)[..., None]
+        return (grid.sampled & is_late).sum(axis=(0, 1))
 
     few = int(prepared.sampled.min())
     if few < FEWEST_SAMPLES:
@@ -429,7 +442,8 @@ def _no_better(y: Signals, error: Signals) -> Float[np.ndarray, " ny"]:
     mean of the other cycles, cycle by cycle (Diebold and Mariano 1995)."""
     sampled = np.isfinite(y)
     n = np.maximum(sampled.sum(axis=(0, 1)), 2)
-    alone = (y - np.nanmean(y, axis=(0, 1))) * n / (n - 1)
+    mean = np.nanmean(y, axis=(0, 1))
+    alone = (y - mean) * n / (n - 1)
     by_cycle = np.nansum(alone**2 - error**2, axis=2)
     gain = by_cycle[sampled.any(axis=(2, 3))]
     deviate = gain.mean(axis=0) * np.sqrt(len(gain))

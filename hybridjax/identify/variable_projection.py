@@ -155,8 +155,10 @@ def late_columns(
     for j in range(len(c) + 1):
         rows = group.weighted(c, delay**j * group.data)
         columns.append(without(q, rows).ravel())
-    taken = (q**2).sum(axis=1).reshape(2, -1).sum(axis=0)
-    left = (2 - taken) / np.abs(chi(group.period_delay, c)) ** 2
+    by_row = (q**2).sum(axis=1)
+    taken = by_row.reshape(2, -1).sum(axis=0)
+    gain = np.abs(chi(group.period_delay, c)) ** 2
+    left = (2 - taken) / gain
     return np.stack(columns, axis=1), left
 
 
@@ -230,7 +232,8 @@ def _linearized(groups: list[HTFGroup], order: int) -> Coefficients:
             break
         last = c
         c = null[1:] / null[0]
-        if np.abs(c - last).max() < _SETTLED_START * (1 + np.abs(c).max()):
+        allowed = _SETTLED_START * (1 + np.abs(c).max())
+        if np.abs(c - last).max() < allowed:
             break
     return c
 
@@ -290,7 +293,8 @@ def unfold(
 ) -> Complex[np.ndarray, "M R ny nu"]:
     """Return the numerators of the HTFs from those of the responses of each group."""
     _, _, ny, nu = htf.H.shape
-    out = np.zeros((len(htf.harmonics), ny, nu, len(numerators[0])), complex)
+    shape = (len(htf.harmonics), ny, nu, len(numerators[0]))
+    out = np.zeros(shape, complex)
     for group, b in zip(groups, numerators, strict=True):
         entries = (group.share * b).T
         i, j = group.channel.T
@@ -366,7 +370,8 @@ def _responses_of(
     half = np.sqrt(0.5)
     w = weight[row]
     v = weight[other]
-    alike = (np.abs(v - w) <= 10.0**-EQUAL_WEIGHTS * w).all(axis=0)
+    allowed = 10.0**-EQUAL_WEIGHTS * w
+    alike = (np.abs(v - w) <= allowed).all(axis=0)
     for channel in np.ndindex(alike.shape):
         at = (slice(None), *channel)
         h = H[row][at]
@@ -442,7 +447,8 @@ def powers_basis(
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
     # (One combination less would change bounds by 0.3 %.)
     kept = s > 0.1 * ROUNDING * s[0]
-    return u[:, kept], vh[kept].conj().T / s[kept]
+    columns = vh[kept].conj().T
+    return u[:, kept], columns / s[kept]
 
 
 def numerator_size(htf: HTF, order: int, extra_lags: int | None) -> int:
@@ -493,13 +499,15 @@ def error_spectrum(
         relative = lines[:, 0, group.channel[:, 1]]
         spectra = _components(group.period_delay, c)
         parts = spectra * group.weight**2 * relative[group.line, 0]
-        size = group.scale**2 / 2 * relative[0] / relative[0, 0]
+        half = group.scale**2 / 2
+        size = half * relative[0] / relative[0, 0]
         residual = (misfit_of(group, c).residual ** 2).sum(axis=0)
         # tr(G_k R G_l R), where R subtracts the best numerators: the mean of `parts[k]` times the
         # squares of the residuals, for errors with the variances `parts[l]`.
         q, _ = group.numerator_space(c)
         rows = np.concatenate([parts, parts], axis=1)
-        along = np.stack([q.T @ (row[:, None] * q) for row in rows])
+        projected = [q.T @ (row[:, None] * q) for row in rows]
+        along = np.stack(projected)
         along = along.reshape(2, -1)
         left = 1 - 2 * (q**2).sum(axis=1)
         products = rows * left @ rows.T + along @ along.T
@@ -507,7 +515,8 @@ def error_spectrum(
             square[i] += size[k] * (parts @ residual[:, k])
             expected[i] += size[k] ** 2 * products
     sizes = np.stack([amounts(*pair) for pair in zip(expected, square, strict=True)])
-    spectrum = sizes @ _components(np.exp(-2j * np.pi * f), c)
+    period_delay = np.exp(-2j * np.pi * f)
+    spectrum = sizes @ _components(period_delay, c)
     return spectrum.T[..., None] * lines
 
 

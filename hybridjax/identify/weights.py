@@ -29,7 +29,8 @@ def check_values(htf: HTF) -> Float[np.ndarray, " ny"]:
         raise DefinitionError(
             "the HTFs hold NaN or infinity: leave these frequencies out."
         )
-    rms = np.sqrt(np.mean(np.abs(H) ** 2, axis=(0, 1, 3)))
+    square = np.abs(H) ** 2
+    rms = np.sqrt(np.mean(square, axis=(0, 1, 3)))
     if (rms == 0).any():
         name = htf.outputs[int(np.argmin(rms))]
         raise DefinitionError(f"the HTFs of {name} are zero: leave this output out.")
@@ -75,7 +76,8 @@ def _separated(
 ) -> Float[np.ndarray, "M F ny nu"]:
     """Return the nearest product of a factor for each frequency and one for each harmonic."""
     _, same = np.unique(np.abs(harmonics), return_inverse=True)
-    size = np.ones((same.max() + 1, 1, *variance.shape[2:]))
+    groups = same.max() + 1
+    size = np.ones((groups, 1, *variance.shape[2:]))
     for _ in range(20):  # more sweeps change nothing in 6 digits
         by_line = (variance / size[same]).mean(axis=0)
         relative = variance / by_line
@@ -95,7 +97,8 @@ def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
 
 def weights_of(variance: Entries, rms: Float[np.ndarray, " ny"]) -> Entries:
     """Return one over the standard deviation of real and imaginary part."""
-    return np.sqrt(2 / np.maximum(variance, (SMALLEST_ERROR * rms[:, None]) ** 2))
+    smallest = (SMALLEST_ERROR * rms[:, None]) ** 2
+    return np.sqrt(2 / np.maximum(variance, smallest))
 
 
 def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
@@ -114,7 +117,10 @@ def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
     **Returns:** L, and the deviation in units of L.
     """
     level = float(np.clip(misfit, 1.0, most))
-    return level, float(np.sqrt(level / (2 - level))) if level < 2 else np.inf
+    spread = np.inf
+    if level < 2:
+        spread = float(np.sqrt(level / (2 - level)))
+    return level, spread
 
 
 def largest_misfit(htf: HTF) -> float:
@@ -133,10 +139,13 @@ def neighbor_correlation(
     """Return the correlation of errors at neighboring frequencies, in which errors that are
     rounding beside the `values` count as zero."""
     ordered = error[:, np.argsort(f)]
-    products = ordered[:, 1:] * ordered[:, :-1].conj()
+    later = ordered[:, 1:]
+    earlier = ordered[:, :-1]
+    products = later * earlier.conj()
     neighbors = np.real(products).mean()
     square = (np.abs(error) ** 2).mean()
-    rounding = np.finfo(float).eps * (np.abs(values) ** 2).mean()
+    power = (np.abs(values) ** 2).mean()
+    rounding = np.finfo(float).eps * power
     return float(neighbors / np.maximum(square, rounding))
 
 

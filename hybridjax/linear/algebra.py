@@ -82,7 +82,8 @@ def connect(
     # Padding goes behind the states of both, which stay in their order.
     is_padding = []
     for x in (a, b):
-        is_padding.append(xp.arange(x.A.shape[1]) >= x.dims[:, None])
+        index = xp.arange(x.A.shape[1])
+        is_padding.append(index >= x.dims[:, None])
     key = xp.concatenate(is_padding, axis=1) * d + xp.arange(d)
     order = xp.argsort(key, axis=1)
     before = order[:, None, :]
@@ -209,7 +210,8 @@ def inverse(P):
 
 def feedback(P, F):
     xp = namespace(P)
-    before = xp.linalg.inv(xp.eye(P.shape[1]) + P @ F)
+    loop = xp.eye(P.shape[1]) + P @ F
+    before = xp.linalg.inv(loop)
     R = before @ P
     after = xp.eye(P.shape[2]) - F @ R
     return R, [(before, after), (R, R)]

@@ -87,7 +87,8 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     A, B, C, _, f = (np.asarray(x)[first] for x in arrays[:5])
     tangents = [np.asarray(x) for x in arrays[5:]]
     # (directions, N, 1, rows, columns): frequencies have the axis after that of sections.
-    dA, dB, dC, dD = (x.reshape(-1, *x.shape[-3:])[:, :, None] for x in tangents)
+    along_sections = [x.reshape(-1, *x.shape[-3:]) for x in tangents]
+    dA, dB, dC, dD = (x[:, :, None] for x in along_sections)
     P, N, _, d, _ = dA.shape
     nu = B.shape[-1]
     F = f.size
@@ -95,18 +96,22 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     X = _states(A, z * B[:, None], f)
     # Directions are further columns of the forcing.
     forcing = dA @ X + z * dB
-    columns = np.moveaxis(forcing, 0, -2).reshape(N, F, d, P * nu)
+    by_direction = np.moveaxis(forcing, 0, -2)
+    columns = by_direction.reshape(N, F, d, P * nu)
     dX = _states(A, columns, f).reshape(N, F, d, P, nu)
     dX = np.moveaxis(dX, -2, 0)
-    dG = (dC @ X + C[:, None] @ dX) / z + dD
+    by_state = C[:, None] @ dX
+    dG = (dC @ X + by_state) / z + dD
     dG = np.fft.fft(dG, axis=1) / N
     return dG.reshape(*lead, N, F, len(C[0]), nu)
 
 
 def _unit_roots(A: Array, f: Array) -> Array:
     """z^n (N, F, 1, 1) at each section."""
-    n = np.arange(len(A))[:, None, None, None] / len(A)
-    return namespace(A).exp(2j * np.pi * n * f[:, None, None])
+    index = np.arange(len(A))[:, None, None, None]
+    n = index / len(A)
+    angles = 2j * np.pi * n * f[:, None, None]
+    return namespace(A).exp(angles)
 
 
 def _states(A: Array, forcing: Array, f: Array) -> Array:
@@ -119,7 +124,8 @@ def _states(A: Array, forcing: Array, f: Array) -> Array:
     start = xp.zeros(forcing.shape[1:], forcing.dtype)
     forced, _ = scan(advance, start, (A, forcing))
     z_N = xp.exp(2j * np.pi * f)[:, None, None]
-    start = solve(z_N * np.eye(A.shape[-1]) - monodromy(A), forced)
+    shifted = z_N * np.eye(A.shape[-1])
+    start = solve(shifted - monodromy(A), forced)
     return scan(advance, start, (A, forcing))[1]
 
 
@@ -144,5 +150,6 @@ def harmonic_transfer(
     """
     z = _unit_roots(A, f)
     x = _states(A, z * B[:, None], f)
-    G = C[:, None] @ x / z + D[:, None]
+    by_state = C[:, None] @ x / z
+    G = by_state + D[:, None]
     return namespace(A).fft.fft(G, axis=0) / len(A)

@@ -230,7 +230,8 @@ class HTF(Showable, eqx.Module):
             curves = []
             for color, k in zip(COLORS, np.sort(largest), strict=False):
                 name = f"H_{self.harmonics[k]}"
-                curves.append(Curve(f[order], size[k, order, j], name, color))
+                shown = size[k, order, j]
+                curves.append(Curve(f[order], shown, name, color))
             axis = with_unit(f"|H|, {u} to {y}", ratio(y, u))
             drawn.append(picture(curves, "f (cycles/period)", axis, log=True))
         about = repr(self).partition(";")[2].removesuffix(")")
@@ -377,7 +378,8 @@ class HTF(Showable, eqx.Module):
         lines = np.flatnonzero(size > _SILENT_LINE * size.max())
         # A real system responds to -f with the conjugate of its response to f.
         f = np.concatenate([self.frequencies, -np.asarray(self.frequencies)])
-        distance = np.abs(self._circle(lines[:, None] / periods - f))
+        fractions = lines[:, None] / periods - f
+        distance = np.abs(self._circle(fractions))
         lost = lines[distance.min(axis=1, initial=np.inf) > SAME_FREQUENCY]
         if len(lost):
             raise DefinitionError(

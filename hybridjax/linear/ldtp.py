@@ -355,7 +355,8 @@ class LDTP(WithMultipliers, eqx.Module):
         L = np.eye(nu + ny, nu)
         K[:nu, ny:] = -np.eye(nu)
         K[nu:, :ny] = np.eye(ny)
-        return self._connected(F, K, L, np.eye(ny, ny + nu), self.inputs, self.outputs)
+        selection = np.eye(ny, ny + nu)
+        return self._connected(F, K, L, selection, self.inputs, self.outputs)
 
     @property
     def matrices(self) -> algebra.Matrices:
@@ -519,7 +520,8 @@ class LDTP(WithMultipliers, eqx.Module):
 
 def _with_a_coordinate(A, B, C) -> tuple[Any, Any, Any]:
     """The matrices, padded to one coordinate if there is none: no axis of an array is empty."""
-    if 0 not in A.shape[1:] or A.shape[1] != A.shape[2]:
+    has_states = 0 not in A.shape[1:]
+    if has_states or A.shape[1] != A.shape[2]:
         return A, B, C
     xp = namespace(A)
     return (
@@ -546,7 +548,8 @@ def _check_padding(ldtp):
     if is_traced(ldtp.A, ldtp.B, ldtp.C, ldtp.dims):
         return
     dims = np.asarray(ldtp.dims)
-    padding = np.arange(ldtp.A.shape[-1]) >= dims[:, None]
+    index = np.arange(ldtp.A.shape[-1])
+    padding = index >= dims[:, None]
     after = np.roll(padding, -1, axis=0)
     outside = {
         "A": (ldtp.A, after[:, :, None] | padding[:, None, :]),

@@ -60,7 +60,8 @@ def product_eigenvalues(
         return np.zeros(0, complex)
     blocks = [_eigenvalues(block) for block in _diagonal_blocks(regular)]
     eigenvalues = np.concatenate(blocks)
-    return eigenvalues[np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))]
+    order = np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))
+    return eigenvalues[order]
 
 
 def _balanced(factors):

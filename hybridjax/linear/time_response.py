@@ -15,7 +15,8 @@ from .algebra import Matrices
 def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
     """The product `A[N-1] ... A[0]`."""
     identity = namespace(A).eye(A.shape[-1], dtype=A.dtype)
-    product, _ = scan(_multiplied, namespace(A).zeros_like(A[0]) + identity, A)
+    start = namespace(A).zeros_like(A[0]) + identity
+    product, _ = scan(_multiplied, start, A)
     return product
 
 
@@ -57,7 +58,8 @@ def impulse_response(m: Matrices, n_lags: int) -> Float[Array, "N lags ny nu"]:
     def advance(x, _):
         return jnp.roll(m.A @ x, 1, axis=0), m.C @ x
 
-    _, later = jax.lax.scan(advance, jnp.roll(m.B, 1, axis=0), length=n_lags - 1)
+    first = jnp.roll(m.B, 1, axis=0)
+    _, later = jax.lax.scan(advance, first, length=n_lags - 1)
     return jnp.concatenate([m.D[None], later]).swapaxes(0, 1)
 
 
@@ -79,7 +81,8 @@ def periodic_states(
     w = xp.tensordot(u, entering, ((2, 3), (0, 2)))
     z_N = np.exp(2j * np.pi * np.arange(periods) / periods)
     resolvent = z_N[:, None, None] * identity - phi
-    starts = solve(resolvent, xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1))
+    spectra = xp.moveaxis(xp.fft.fft(w, axis=1), 0, -1)
+    starts = solve(resolvent, spectra)
     return starts.mean(axis=0).real.T
 
 

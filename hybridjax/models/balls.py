@@ -65,7 +65,9 @@ class PaddleJuggler(HybridSystem):
     def paddle(self, t: ArrayLike) -> tuple[Array, Array]:
         """Height and speed of the paddle."""
         phase = self.rate * t
-        return self.A * jnp.sin(phase), self.A * self.rate * jnp.cos(phase)
+        height = self.A * jnp.sin(phase)
+        speed = self.A * self.rate * jnp.cos(phase)
+        return height, speed
 
     def exact(self):
         """Time of the impact, height and speed of the ball right after it, and the multipliers."""
@@ -75,9 +77,11 @@ class PaddleJuggler(HybridSystem):
         t = jnp.arccos(speed / (self.A * self.rate)) / self.rate
         y, _ = self.paddle(t)
         acceleration = -(self.rate**2) * y
-        trace = 1 + a**2 + (1 + a) ** 2 * acceleration / self.g
+        by_paddle = (1 + a) ** 2 * acceleration / self.g
+        trace = 1 + a**2 + by_paddle
         root = jnp.sqrt(trace**2 / 4 - a**2 + 0j)
-        return t, y, v, jnp.stack([trace / 2 + root, trace / 2 - root])
+        multipliers = jnp.stack([trace / 2 + root, trace / 2 - root])
+        return t, y, v, multipliers
 
     def charts(self):
         return {
@@ -90,7 +94,8 @@ class PaddleJuggler(HybridSystem):
         def bounce(t, q, u):
             a = self.restitution
             _, speed = self.paddle(t)
-            return q[0], -a * q[1] + (1 + a) * (speed + u[0])
+            by_paddle = (1 + a) * (speed + u[0])
+            return q[0], -a * q[1] + by_paddle
 
         def above(t, q, u):
             return q[0] - self.paddle(t)[0]
@@ -121,7 +126,9 @@ class ChainContact(eqx.Module):
         chain = self.chain
         rate = 2 * jnp.pi / chain.T
         phase = rate * t - 2 * jnp.pi * self.i / chain.n
-        return chain.A * jnp.sin(phase), chain.A * rate * jnp.cos(phase)
+        height = chain.A * jnp.sin(phase)
+        speed = chain.A * rate * jnp.cos(phase)
+        return height, speed
 
     def gap(self, t, q, u):
         return q[self.i] - self.table(t)[0]
@@ -171,8 +178,11 @@ class BouncingChain(HybridSystem):
     def _flight(self, t, q, u):
         y = q[: self.n]
         v = q[self.n :]
-        stretch = self.k * jnp.diff(y) + self.c * jnp.diff(v)
-        force = jnp.diff(jnp.pad(stretch, 1)).at[0].add(u[0])
+        spring = self.k * jnp.diff(y)
+        damper = self.c * jnp.diff(v)
+        stretch = spring + damper
+        between = jnp.diff(jnp.pad(stretch, 1))
+        force = between.at[0].add(u[0])
         return jnp.concatenate([v, force / self.m - self.g])
 
     def transitions(self):

@@ -69,7 +69,8 @@ def accelerations_under_feedback(
     linearization) and do not compensate the further `torque`.
     """
     mass = mechanism.mass(q)
-    residual = jnp.sum(mechanism.bias(q, v)) + jnp.sum(mass @ desired)
+    inertia = jnp.sum(mass @ desired)
+    residual = jnp.sum(mechanism.bias(q, v)) + inertia
     x = -residual / jnp.sum(mass @ direction)
     return desired + direction * x + solve_positive(mass, torque)
 
@@ -155,13 +156,16 @@ class TorsoWalker(HybridSystem):
 
     def charts(self):
         states = ("th1", "th2", "th3", "w1", "w2", "w3")
-        return {"step": FieldChart(self._step, states, ("rad",) * 3 + ("rad/s",) * 3)}
+        units = ("rad",) * 3 + ("rad/s",) * 3
+        return {"step": FieldChart(self._step, states, units)}
 
     def _step(self, t, state, u):
         q = state[:3]
         v = state[3:]
         upright = held(q[2] - self.lean, v[2], self.stiffness)
-        mirrored = held(q[0] + q[1], v[0] + v[1], self.stiffness)
+        angle = q[0] + q[1]
+        rate = v[0] + v[1]
+        mirrored = held(angle, rate, self.stiffness)
         desired = jnp.stack([jnp.zeros_like(upright), mirrored, upright])
         direction = jnp.array([1.0, -1.0, 0.0])
         torque = u[0] * jnp.array([0.0, -1.0, 1.0])
@@ -188,10 +192,12 @@ class TorsoWalker(HybridSystem):
 
     def _swing_foot(self, q):
         legs = self.r * np.array([[1.0, -1.0, 0.0]])
-        return q[3:] + tips(legs, q[:3])[:, 0]
+        foot = tips(legs, q[:3])[:, 0]
+        return q[3:] + foot
 
     def draw(self, chart, t, q):
-        return self.mechanism().draw(jnp.stack(list(q.values())[:3]), _GROUND, "stance")
+        angles = jnp.stack(list(q.values())[:3])
+        return self.mechanism().draw(angles, _GROUND, "stance")
 
     def guess(self):
         start = -self.stride, self.stride, self.lean, 1.5, -1.5, 0.0
@@ -303,7 +309,8 @@ class FiveLinkBiped(HybridSystem):
 
     def _swing_foot(self, q):
         """Position (x, y) of the swing foot relative to the stance foot."""
-        legs = self.length * np.array([[1.0, 1.0, 0.0, -1.0, -1.0]])
+        signs = np.array([[1.0, 1.0, 0.0, -1.0, -1.0]])
+        legs = self.length * signs
         return tips(legs, q[:5])[:, 0]
 
     def outputs(self):
@@ -313,7 +320,8 @@ class FiveLinkBiped(HybridSystem):
     def charts(self):
         links = ("shin", "thigh", "torso", "swing_thigh", "swing_shin")
         states = (*links, *(f"{x}_rate" for x in links))
-        return {"step": FieldChart(self._step, states, ("rad",) * 5 + ("rad/s",) * 5)}
+        units = ("rad",) * 5 + ("rad/s",) * 5
+        return {"step": FieldChart(self._step, states, units)}
 
     def _step(self, t, state, u):
         q = state[:5]
@@ -364,7 +372,8 @@ class FiveLinkBiped(HybridSystem):
             ]
         )
         unit = jnp.ones_like(slope)
-        direction = jnp.stack([unit, unit, 0 * unit, -1 - slope / 2, -1 + slope / 2])
+        half = slope / 2
+        direction = jnp.stack([unit, unit, 0 * unit, -1 - half, -1 + half])
         return desired, direction
 
     def transitions(self):
@@ -392,7 +401,8 @@ class FiveLinkBiped(HybridSystem):
         )
 
     def draw(self, chart, t, q):
-        return self.mechanism().draw(jnp.stack(list(q.values())[:5]), _GROUND, "stance")
+        angles = jnp.stack(list(q.values())[:5])
+        return self.mechanism().draw(angles, _GROUND, "stance")
 
     def guess(self):
         s = self.stride

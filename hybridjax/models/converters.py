@@ -39,7 +39,8 @@ class BuckConverter(HybridSystem):
         u: Float[Array, "1"],
     ) -> Array:
         """Amplified error less the ramp: the switch is closed where this is negative."""
-        return self.gain * (q[0] - self.Vref - u[0]) - q[2]
+        error = q[0] - self.Vref - u[0]
+        return self.gain * error - q[2]
 
     def charts(self):
         return {"open": self._circuit(0.0), "closed": self._circuit(self.Vin)}
@@ -48,7 +49,9 @@ class BuckConverter(HybridSystem):
         def field(t, q, u):
             v, i, _ = q
             ramp = (self.upper - self.lower) / self.T
-            return (i - v / self.R) / self.C, (supply - v) / self.L, ramp
+            voltage_rate = (i - v / self.R) / self.C
+            current_rate = (supply - v) / self.L
+            return voltage_rate, current_rate, ramp
 
         return FieldChart(field, ("v", "i", "ramp"), ("V", "A", "V"))
 

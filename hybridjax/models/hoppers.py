@@ -79,7 +79,8 @@ class VerticalHopper(HybridSystem):
             yM, vM, ym, vm = q
             leg = self.leg(t, yM, ym)
             body = (leg + u[0]) / self.M - self.g
-            return vM, body, vm, (on_foot(ym, vm) - leg) / self.m - self.g
+            foot = (on_foot(ym, vm) - leg) / self.m - self.g
+            return vM, body, vm, foot
 
         return field
 
@@ -202,10 +203,13 @@ class HopperPair(VerticalHopper):
             feet = []
             for i, between in enumerate((pull, -pull)):
                 y, v = whole[2 * i : 2 * i + 2]
-                ym, vm = whole[2 * i + 4 : 2 * i + 6]
+                first = 2 * i + 4
+                ym, vm = whole[first : 2 * i + 6]
                 leg = self.leg(t - i * self.lag, y, ym)
-                bodies += [v, (leg + between + u[i]) / self.M - self.g]
-                feet += [vm, -(leg + self.b * vm) / self.m - self.g]
+                body = (leg + between + u[i]) / self.M - self.g
+                bodies += [v, body]
+                foot = -(leg + self.b * vm) / self.m - self.g
+                feet += [vm, foot]
             return _part(down, bodies + feet)
 
         states = tuple(_part(down, _STATES))
@@ -223,16 +227,20 @@ class HopperPair(VerticalHopper):
 
         def guard(t, q, u):
             whole = _whole(down, q)
-            force = self.leg(t - i * self.lag, whole[2 * i], 0.0) + self.m * self.g
+            late = t - i * self.lag
+            weight = self.m * self.g
+            force = self.leg(late, whole[2 * i], 0.0) + weight
             return force if lifts else whole[2 * i + 4]
 
         def reset(t, q, u):
             whole = _whole(down, q)
             if not lifts:
-                whole[2 * i + 1] = self.retention * whole[2 * i + 1]
+                v = 2 * i + 1
+                whole[v] = self.retention * whole[v]
             return _part(after, whole)
 
-        name = f"{'liftoff' if lifts else 'touchdown'} {i + 1} ({_PAIR_CHARTS[down]})"
+        what = "liftoff" if lifts else "touchdown"
+        name = f"{what} {i + 1} ({_PAIR_CHARTS[down]})"
         return Transition(
             name, _PAIR_CHARTS[down], _PAIR_CHARTS[after], guard, reset=reset
         )
@@ -241,7 +249,9 @@ class HopperPair(VerticalHopper):
         first, circles = _hopper(0, q["yM1"], q["ym1"])
         second, more_circles = _hopper(1, q["yM2"], q["ym2"])
         lines = {"ground": [(-1.0, 0.0), (2.5, 0.0)], **first, **second}
-        lines["coupling"] = Drawing.spring((0.3, q["yM1"]), (1.2, q["yM2"]))
+        left = (0.3, q["yM1"])
+        right = (1.2, q["yM2"])
+        lines["coupling"] = Drawing.spring(left, right)
         return Drawing(lines, circles={**circles, **more_circles})
 
     def guess(self):

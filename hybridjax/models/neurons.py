@@ -23,7 +23,8 @@ class DrivenNeuron(HybridSystem):
     T: AbstractVar[Parameter]
 
     def total_current(self, t, u):
-        drive = self.amplitude * jnp.cos(2 * jnp.pi * t / self.T)
+        wave = jnp.cos(2 * jnp.pi * t / self.T)
+        drive = self.amplitude * wave
         return self.current + drive + u[0]
 
     @abc.abstractmethod
@@ -79,8 +80,10 @@ class AdExNeuron(DrivenNeuron):
     def _membrane(self, t, q, u):
         v, w = q
         spike = self.slope * jnp.exp((v - self.threshold) / self.slope)
-        total = self.gL * (self.EL - v + spike) - w + self.total_current(t, u)
-        return total / self.C, (self.a * (v - self.EL) - w) / self.tau
+        membrane = self.gL * (self.EL - v + spike)
+        total = membrane - w + self.total_current(t, u)
+        recovery = (self.a * (v - self.EL) - w) / self.tau
+        return total / self.C, recovery
 
     def after_spike(self, t, q, u):
         return self.EL, q[1] + self.b
@@ -115,7 +118,8 @@ class IzhikevichNeuron(DrivenNeuron):
 
     def _membrane(self, t, q, u):
         v, w = q
-        rate = 0.04 * v**2 + 5 * v + 140 - w + self.total_current(t, u)
+        own = 0.04 * v**2 + 5 * v + 140
+        rate = own - w + self.total_current(t, u)
         return rate, self.a * (self.b * v - w)
 
     def after_spike(self, t, q, u):
@@ -145,7 +149,8 @@ class FitzHughNagumo(HybridSystem):
 
     def _membrane(self, t, q, u):
         v, w = q
-        fast = (v - v**3 / 3 - w + self.current + u[0]) / self.eps
+        rise = v - v**3 / 3 - w
+        fast = (rise + self.current + u[0]) / self.eps
         return fast, v + self.a - self.b * w
 
     def guess(self):

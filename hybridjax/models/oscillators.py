@@ -53,7 +53,8 @@ class Duffing(HybridSystem):
     def _line(self, t, q, u):
         x, v = q
         force = self.amplitude * jnp.cos(self.rate * t) + u[0]
-        return v, force - self.damping * v - self.alpha * x - self.beta * x**3
+        spring = force - self.damping * v - self.alpha * x
+        return v, spring - self.beta * x**3
 
     def period(self):
         return 2 * jnp.pi / self.rate
@@ -154,7 +155,9 @@ class HopfOscillator(HybridSystem):
         x, y = q
         growth = self.mu - x**2 - y**2
         rate = 2 * jnp.pi / self.T
-        return growth * x - rate * y + u[0], rate * x + growth * y
+        x_rate = growth * x - rate * y + u[0]
+        y_rate = rate * x + growth * y
+        return x_rate, y_rate
 
     def guess(self):
         return Guess("plane", (1.1 * jnp.sqrt(self.mu), 0.0))
@@ -173,7 +176,8 @@ class VanDerPol(HybridSystem):
 
     def _plane(self, t, q, u):
         x, v = q
-        return v, self.mu * (1 - x**2) * v - x + u[0]
+        damping = self.mu * (1 - x**2) * v
+        return v, damping - x + u[0]
 
     def guess(self):
         return Guess("oscillation", (2.0, 0.0))
@@ -218,7 +222,8 @@ class BeltOscillator(HybridSystem):
         def field(t, q, u):
             friction = self.friction / (1 + self.decay * side * (q[1] - self.belt))
             spring = self.k * q[0]
-            return q[1], (u[0] - spring - side * friction) / self.m
+            force = u[0] - spring - side * friction
+            return q[1], force / self.m
 
         return FieldChart(field, ("x", "v"), ("m", "m/s"))
 
@@ -226,7 +231,8 @@ class BeltOscillator(HybridSystem):
         return _block(q["x"], self.friction / self.k, self.belt)
 
     def guess(self):
-        return Guess("sticks", jnp.stack([0.5 * self.friction / self.k, self.belt]))
+        stretch = 0.5 * self.friction / self.k
+        return Guess("sticks", jnp.stack([stretch, self.belt]))
 
 
 class ChuaCircuit(HybridSystem):
@@ -257,7 +263,9 @@ class ChuaCircuit(HybridSystem):
                 resistor = self.outer * (x - side) + self.inner * side
             else:
                 resistor = self.inner * x
-            return self.alpha * (y - resistor) + u[0], x - y + z, -self.beta * y
+            x_rate = self.alpha * (y - resistor) + u[0]
+            y_rate = x - y + z
+            return x_rate, y_rate, -self.beta * y
 
         return FieldChart(field, ("x", "y", "z"))
 

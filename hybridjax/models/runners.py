@@ -65,7 +65,8 @@ class TwoLeggedBar(HybridSystem):
     def length(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
         """Length of a standing leg less its rest length: the foot's height while in the air."""
         y, _, q, _ = state
-        table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
+        wave = jnp.sin(2 * jnp.pi * t / self.T)
+        table = self.A * wave
         return y + self.hip(leg) * q - table - self.l0
 
     def speed(self, leg: Leg, t: ArrayLike, state: Float[Array, "4"]) -> Array:
@@ -125,14 +126,16 @@ class TwoLeggedBar(HybridSystem):
         impulse = (
             -(1 - self.rho) * self.speed(leg, t, state) / (1 / self.m + s**2 / self.J)
         )
-        return y, v + impulse / self.m, q, p + s * impulse / self.J
+        after = v + impulse / self.m
+        return y, after, q, p + s * impulse / self.J
 
     def period(self):
         return self.T
 
     def draw(self, chart, t, q):
         """The table, the bar, and legs that have their rest length in the air."""
-        table = self.A * jnp.sin(2 * jnp.pi * t / self.T)
+        wave = jnp.sin(2 * jnp.pi * t / self.T)
+        table = self.A * wave
         hips = []
         for leg in _LEGS:
             hip = self.hip(leg)
@@ -239,10 +242,12 @@ class SLIPRunner(HybridSystem):
 
     def transitions(self):
         def height(t, q, u):
-            return q[0] - self.l0 * jnp.sin(self.angle + u[0])
+            drop = self.l0 * jnp.sin(self.angle + u[0])
+            return q[0] - drop
 
         def landed(t, q, u):
-            return (-self.l0 * jnp.cos(self.angle + u[0]), *q)
+            foot = -self.l0 * jnp.cos(self.angle + u[0])
+            return (foot, *q)
 
         def down(t, q, u):
             return q[2] < 0

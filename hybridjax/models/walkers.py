@@ -13,7 +13,8 @@ from ..systems.transition import Transition
 
 def _slope(angle: Parameter, length: Parameter | float = 1.0) -> Array:
     """The ground under a stance foot at the origin, which falls towards x > 0."""
-    way = length * jnp.stack([jnp.cos(angle), -jnp.sin(angle)])
+    direction = jnp.stack([jnp.cos(angle), -jnp.sin(angle)])
+    way = length * direction
     return jnp.stack([-way, way])
 
 
@@ -71,12 +72,14 @@ class RimlessWheel(HybridSystem):
     def exact(self):
         """Speed right after an impact, and the multiplier."""
         spread = jnp.sin(self.alpha) * jnp.sin(self.slope)
-        w = jnp.sqrt(4 * self.rate * spread) / jnp.tan(2 * self.alpha)
+        square = 4 * self.rate * spread
+        w = jnp.sqrt(square) / jnp.tan(2 * self.alpha)
         return w, jnp.cos(2 * self.alpha) ** 2
 
     def charts(self):
         def swing(t, q, u):
-            return (q[1], self.rate * jnp.sin(q[0]) + u[0])
+            gravity = self.rate * jnp.sin(q[0])
+            return (q[1], gravity + u[0])
 
         return {"swing": FieldChart(swing, ("th", "w"), ("rad", "rad/s"))}
 
@@ -94,8 +97,11 @@ class RimlessWheel(HybridSystem):
 
     def draw(self, chart, t, q):
         """With spokes of 1 m, of which up to 24 are drawn."""
-        angles = q["th"] + 2 * self.alpha * (jnp.arange(24) % self.spokes)
-        hub = jnp.stack([jnp.sin(q["th"]), jnp.cos(q["th"])])
+        turned = jnp.arange(24) % self.spokes
+        angles = q["th"] + 2 * self.alpha * turned
+        x = jnp.sin(q["th"])
+        y = jnp.cos(q["th"])
+        hub = jnp.stack([x, y])
         tips = hub - jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1)
         spokes = jnp.stack([jnp.broadcast_to(hub, tips.shape), tips], axis=1).reshape(
             -1, 2
@@ -131,7 +137,8 @@ class SimplestWalker(HybridSystem):
     def _step(self, t, q, u):
         th, phi, w, p = q
         stance = jnp.sin(th - self.slope)
-        swing = (w**2 - jnp.cos(th - self.slope)) * jnp.sin(phi)
+        pull = w**2 - jnp.cos(th - self.slope)
+        swing = pull * jnp.sin(phi)
         return w, p, stance, stance + swing + u[0]
 
     def transitions(self):
@@ -164,11 +171,13 @@ class SimplestWalker(HybridSystem):
 def _heelstrike(t, q, u):
     th, _, w, _ = q
     c = jnp.cos(2 * th)
-    return -th, -2 * th, c * w, c * (1 - c) * w
+    hip = c * (1 - c) * w
+    return -th, -2 * th, c * w, hip
 
 
 def _after_heelstrike(th, w):
-    return Guess("step", (th, 2 * th, w, (1 - jnp.cos(2 * th)) * w))
+    swing = (1 - jnp.cos(2 * th)) * w
+    return Guess("step", (th, 2 * th, w, swing))
 
 
 class CompassGait(HybridSystem):
@@ -217,7 +226,8 @@ class CompassGait(HybridSystem):
         gravity = self.g * (mH * length + m * a + m * length)
         weight = m * self.g * b * jnp.sin(n)
         torque_n = -d * vs**2 - weight + u[0]
-        torque_s = d * vn**2 + gravity * jnp.sin(s) - u[0]
+        pull = gravity * jnp.sin(s)
+        torque_s = d * vn**2 + pull - u[0]
         # The inverse of [[A, B], [B, D]].
         A = m * b**2
         B = -coupling * c

@@ -211,7 +211,8 @@ class Tiles(NamedTuple):
             going = np.flatnonzero(out.excess > 1)
             if not len(going):
                 break
-            part = self._step(rows[going], *_pick((out.anchor, out.period), going))
+            picked = _pick((out.anchor, out.period), going)
+            part = self._step(rows[going], *picked)
             out = _replace(
                 out, going, part._replace(steps=part.steps + out.steps[going])
             )
@@ -223,8 +224,10 @@ class Tiles(NamedTuple):
     def _step(self, rows, anchor: Lanes, period) -> Rounds:
         """One step of Newton's method."""
         anchor, period, turn, codes, together = self._turn(rows, anchor, period)
-        sizes = np.asarray(self.map.settings.scale)[anchor.chart[:, 0]]
-        jacobian = turn.jacobian * sizes[:, None, :] / sizes[:, :, None]
+        scale = np.asarray(self.map.settings.scale)
+        sizes = scale[anchor.chart[:, 0]]
+        ratio = turn.jacobian * sizes[:, None, :]
+        jacobian = ratio / sizes[:, :, None]
         step = newton_steps(jacobian, turn.residual / sizes)
         q = anchor.q[..., 0] + step * sizes
         size = excess(q / sizes, step)
@@ -234,7 +237,8 @@ class Tiles(NamedTuple):
             self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
         )
         # (Newton's method does not lead to a cycle that begins in another chart: turns do.)
-        other = (turn.result == Result.OK) & (turn.end.chart != anchor.chart)[:, 0]
+        is_elsewhere = (turn.end.chart != anchor.chart)[:, 0]
+        other = (turn.result == Result.OK) & is_elsewhere
         anchor = anchor._replace(q=q[..., None])
         anchor.q[other] = turn.end.q[other]
         anchor.chart[other] = turn.end.chart[other]
@@ -376,7 +380,12 @@ def _of_one_width(parts):
     def fill(x):
         return (0, 0), (0, width - x.shape[1])
 
-    return [np.pad(x, fill(x), constant_values=-1) if x.ndim == 2 else x for x in parts]
+    padded = []
+    for x in parts:
+        if x.ndim == 2:
+            x = np.pad(x, fill(x), constant_values=-1)
+        padded.append(x)
+    return padded
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
@@ -392,7 +401,8 @@ def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
 
 def front(codes: Int[np.ndarray, "S R"]) -> Int[np.ndarray, "S E"]:
     """Codes of events moved to the front of each row, without the columns that are empty."""
-    row, column = np.divmod(np.flatnonzero(codes >= 0), codes.shape[1])
+    places = np.flatnonzero(codes >= 0)
+    row, column = np.divmod(places, codes.shape[1])
     count = np.bincount(row, minlength=len(codes))
     width = max(count.max(initial=0), 1)
     out = np.full((len(codes), width), -1, codes.dtype)

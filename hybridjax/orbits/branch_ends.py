@@ -96,7 +96,8 @@ def _touched_section(cycle: LimitCycle) -> End | None:
     expanded = kernels.watched(s, a, target.levels, t, q, u, first)
     row = expanded[-1, :, 0]
     field = kernels.field(s, a, t, q, u)[:, 0, 0]
-    if not _is_slow(row, field, map.scale[a, :n], float(cycle.period)):
+    period = float(cycle.period)
+    if not _is_slow(row, field, map.scale[a, :n], period):
         return None
     text = (
         f"the cycle touches its section ({map.base}) tangentially, and does not cross it any more: "
@@ -133,7 +134,8 @@ def _is_slow(row, field, sizes, period: float) -> bool:
     slope = row[2 : 2 + len(field)]
     fastest = np.maximum(np.abs(field), sizes / period)
     possible = abs(row[1]) + np.abs(slope) @ fastest
-    return bool(abs(row[1] + slope @ field) < _SLOW * possible)
+    rate = row[1] + slope @ field
+    return bool(abs(rate) < _SLOW * possible)
 
 
 def _change_of_order(cycle: LimitCycle, visits: list[Visit]) -> End | None:
@@ -174,7 +176,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
             if _has_minimum(level, near):
                 text = f"the guard of '{name}' is touched tangentially (grazing)"
                 return End(Result.GRAZING, text)
-            is_least_at_begin = np.argmin(level[:-1]) == 0 and level[0] <= near
+            least = np.argmin(level[:-1])
+            is_least_at_begin = least == 0 and level[0] <= near
             if before.event >= 0 and g != before.event and is_least_at_begin:
                 earlier = s.transitions[before.event].name
                 text = f"the event '{name}' begins to happen at once after '{earlier}'"
@@ -189,7 +192,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
 def _has_minimum(level: np.ndarray, near: float) -> bool:
     """True if a guard has a minimum close to zero within a stay, after which it grows again."""
     inside = level[1:-1]
-    lowest = (inside < level[:-2]) & (inside <= level[2:])
+    below_last = inside < level[:-2]
+    lowest = below_last & (inside <= level[2:])
     return bool(np.any(lowest & (np.abs(inside) <= near)))
 
 
@@ -202,8 +206,10 @@ def _near_rest(cycle: LimitCycle, visits: list[Visit], result: Result) -> End | 
     u = np.zeros((s.nu, 1))
     slowest = np.inf
     for visit in visits:
-        rates = kernels.field(s, visit.chart, visit.t, visit.q, u)[:, 0]
-        speeds = np.abs(rates) / scale[visit.chart, : len(rates), None]
+        rows = kernels.field(s, visit.chart, visit.t, visit.q, u)
+        rates = rows[:, 0]
+        sizes = scale[visit.chart, : len(rates), None]
+        speeds = np.abs(rates) / sizes
         slowest = min(slowest, float(speeds.max(axis=0).min()))
     if slowest * float(cycle.period) > _REST:
         return None

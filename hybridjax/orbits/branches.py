@@ -69,7 +69,8 @@ class BranchPoint(NamedTuple):
     @property
     def critical(self) -> Complex[np.ndarray, " c"]:
         """The multipliers on the unit circle."""
-        return self.multipliers[np.abs(np.abs(self.multipliers) - 1) < SAME]
+        off_circle = np.abs(np.abs(self.multipliers) - 1)
+        return self.multipliers[off_circle < SAME]
 
 
 class BranchEnd(NamedTuple):
@@ -172,7 +173,8 @@ class Branch(Showable, eqx.Module):
             Line(self.values[marks], largest[marks], color=COLORS[1], points=True),
         ]
         drawn = picture(curves, self.parameter, "largest modulus of multipliers")
-        title = f"of {type(self.cycles.systems).__name__}: {len(self)} cycles"
+        kind = type(self.cycles.systems).__name__
+        title = f"of {kind}: {len(self)} cycles"
         return card("Branch", title, table(("", self.parameter, ""), rows), drawn)
 
 
@@ -286,7 +288,8 @@ def _branch(
     high = int(min(bad[bad > start], default=len(points)))
     begin, end = ends
     if low > 0:
-        begin = _refused(points[low].value, points[low - 1], cycles[low - 1])
+        refused = points[low - 1]
+        begin = _refused(points[low].value, refused, cycles[low - 1])
     if high < len(points):
         end = _refused(points[high - 1].value, points[high], cycles[high])
     if (low, high) != (0, len(points)):

@@ -103,10 +103,12 @@ def check_claims(
     for a in np.unique(chart).tolist():
         n = s.dims[a]
         rows = np.flatnonzero(chart == a)
-        sizes = np.concatenate([[time], np.asarray(scale)[a, :n]])
+        of_states = np.asarray(scale)[a, :n]
+        sizes = np.concatenate([[time], of_states])
         # (As many times of one period in all as show pulses.)
         every = -(-_TIMES // len(rows)) if may_be_sudden(s, a, _all) else 1
-        times = t[rows, None] + time * (_BASE + np.arange(every) / every)
+        parts = _BASE + np.arange(every) / every
+        times = t[rows, None] + time * parts
         states = q[:n, rows].repeat(every, axis=1)
         for name, function in _functions(s, a):
             _compare(s, name, function, times.ravel(), states, sizes)
@@ -155,7 +157,8 @@ def _check_output_period(cycle: LimitCycle, output: Output) -> None:
     scale = np.asarray(cycle.settings.scale)
     for a, t, q in points(s, cycle.pieces):
         if s.resolve_outputs(output).defined(a):
-            sizes = np.append(float(cycle.period), scale[a, : len(q)])
+            of_states = scale[a, : len(q)]
+            sizes = np.append(float(cycle.period), of_states)
             name, function = _output(s, a, output)
             _compare(s, name, function, t, q, sizes)
 
@@ -203,7 +206,8 @@ def _functions(s: Structure, a: int) -> Iterator[tuple[str, Callable]]:
 
     yield f"the field of chart '{s.names[a]}'", field
     for k, g in enumerate(s.guards(a)):
-        yield f"the guard of '{s.transitions[g].name}'", _guard(s, a, k)
+        guard_of = _guard(s, a, k)
+        yield f"the guard of '{s.transitions[g].name}'", guard_of
     for g in s.guards(a) + s.schedules(a):
         name = s.transitions[g].name
         yield f"the reset of '{name}'", _reset(s, g)
@@ -220,7 +224,8 @@ def _guard(s: Structure, a: int, k: int) -> Callable:
     index = np.zeros(1, np.int32)
 
     def guard(t, q):
-        return kernels.watched(s, a, None, t, q, u, index)[k : k + 1]
+        rows = kernels.watched(s, a, None, t, q, u, index)
+        return rows[k : k + 1]
 
     return guard
 
@@ -240,7 +245,8 @@ def _predicate(s: Structure, g: int) -> Callable:
     u = np.zeros((s.nu, 1))
 
     def predicate(t, q):
-        holds = kernels.enabled(s, s.member(g), t, q, u).astype(float)
+        rows = kernels.enabled(s, s.member(g), t, q, u)
+        holds = rows.astype(float)
         derivatives = np.zeros((1 + len(q), len(t)))
         return np.concatenate([holds[None], derivatives])[None]
 
@@ -302,7 +308,9 @@ def check_jumps(cycle: LimitCycle) -> None:
     t, chart, q = path.dense(16)  # (fewer: jumps are missed behind kinks; more: time)
     events = path.t[path.event >= 0]
     if path.event[-1] < 0:  # the cycle may begin where the field jumps
-        t, chart, q = (np.concatenate([x, x[1:2]]) for x in (t, chart, q))
+        t = np.concatenate([t, t[1:2]])
+        chart = np.concatenate([chart, chart[1:2]])
+        q = np.concatenate([q, q[1:2]])
         t[-1] += period
     scale = np.asarray(cycle.settings.scale)
     for a in charts:
@@ -318,7 +326,8 @@ def check_jumps(cycle: LimitCycle) -> None:
         for time, column, jump in jumps(
             s, a, samples[before], samples[before + 1], sizes
         ):
-            apart = np.abs(time - events + period / 2) % period - period / 2
+            shifted = np.abs(time - events + period / 2)
+            apart = shifted % period - period / 2
             if np.abs(apart).min(initial=np.inf) > SAME * period:
                 raise DefinitionError(
                     f"the {column_name(s, a, column)} in chart '{s.names[a]}' jumps by {jump:.3g} "
@@ -348,7 +357,8 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
     values, gradients = map.outputs(cycle.anchor.q[:, 0], names)
     changes = gradients @ monodromy(cycle.factors) - gradients
     changes = np.abs(changes * map.sizes).max(axis=1)
-    kept = changes <= SAME * np.abs(gradients * map.sizes).max(axis=1)
+    largest = np.abs(gradients * map.sizes).max(axis=1)
+    kept = changes <= SAME * largest
     conserved = np.flatnonzero(kept).tolist()
     return {names[k]: float(values[k]) for k in conserved}
 

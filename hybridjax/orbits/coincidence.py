@@ -100,7 +100,8 @@ def groups_on(
     **Arguments:** `scale`: sizes of the states by chart.
     """
     times = path.t[rows]
-    starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > TOGETHER * period)
+    steps = np.diff(times, prepend=-np.inf)
+    starts = np.flatnonzero(steps > TOGETHER * period)
     groups: list[SimultaneousEvents | None] = []
     for first, after in itertools.pairwise([*starts, len(rows)]):
         group = rows[first:after].tolist()
@@ -190,7 +191,8 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     by_reset = expanded[:, 1:, 0]
     direct = np.concatenate([[by_t], np.zeros(n), by_u])
     change = direct + by_q @ by_reset
-    size = np.abs(direct) + np.abs(by_q) @ np.abs(by_reset)
+    by_rows = np.abs(by_q) @ np.abs(by_reset)
+    size = np.abs(direct) + by_rows
     if is_scheduled:  # (its time is the same in all neighbors)
         change[0] = 0.0
     return bool((np.abs(change) <= ROUNDING * size).all())
@@ -236,9 +238,11 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
     found = set()
     for g in s.guards(a):
         event = jump(s, g, times, states, u)
-        was_positive = event.level[0] > TOGETHER * period * abs(event.rate[0])
+        zero = TOGETHER * period * abs(event.rate[0])
+        was_positive = event.level[0] > zero
         falls = falls_within(event.level[1], event.rate[1], TOGETHER * period)
-        predicate = kernels.enabled(s, s.member(g), times[1:], states[1:].T, u)
+        member = s.member(g)
+        predicate = kernels.enabled(s, member, times[1:], states[1:].T, u)
         holds = predicate.all()
         if g not in events and was_positive and falls and holds:
             found.add(g)
@@ -248,7 +252,8 @@ def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[i
 def _scheduled_at(s: Structure, g: int, t: float, within: float) -> bool:
     """True if scheduled event g happens at t."""
     schedule = cast(Scheduled, s.transitions[g].guard)
-    return abs(float(schedule.nearest(np.asarray(t))) - t) <= within
+    nearest = schedule.nearest(np.asarray(t))
+    return abs(float(nearest) - t) <= within
 
 
 def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> bool:
@@ -262,7 +267,8 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
     for order in orders:
         derivative = order.derivative * scale[a, :n]
         rows.append(np.column_stack([order.state, derivative]))
-    apart = np.ptp(rows, axis=0) / scale[orders[0].chart, :m, None]
+    of_states = scale[orders[0].chart, :m, None]
+    apart = np.ptp(rows, axis=0) / of_states
     return bool(np.max(apart) < SAME)
 
 
@@ -315,10 +321,12 @@ def _guards_due(
     if not guards:
         return []
     first = np.zeros(1, np.int32)
-    watched = kernels.watched(s, a, None, time, q.T, u, first)[:, :, 0]
+    rows = kernels.watched(s, a, None, time, q.T, u, first)
+    watched = rows[:, :, 0]
     field = kernels.field(s, a, time, q.T, u)[:, 0, 0]
     level, by_t = watched[:, 0], watched[:, 1]
-    rate = by_t + watched[:, 2 : 2 + len(field)] @ field
+    by_state = watched[:, 2 : 2 + len(field)]
+    rate = by_t + by_state @ field
     return [guards[k] for k in np.flatnonzero(falls_within(level, rate, due))]
 
 
@@ -334,7 +342,8 @@ def check_begin(map: ReturnMap) -> None:
     due &= falls_within(guards, rates, TOGETHER * float(map.expected))
     if base is not None:
         # (Events that follow at once have been armed by the event that led to the anchor.)
-        due |= np.asarray(map.anchor.armed)[:, 0] & (guards < 0)
+        armed = np.asarray(map.anchor.armed)[:, 0]
+        due |= armed & (guards < 0)
         due[map.event] = False
     if due.any():
         raise ComputationError(about_begin(map, int(np.argmax(due))))
@@ -356,4 +365,5 @@ def about_begin(map: ReturnMap, g: int) -> str:
 def _at_anchor(map: ReturnMap):
     """The guards (G,) at the anchor, and their rates."""
     watched = map.watch(map.anchor, until(map.anchor.t))
-    return watched.value[:-1, 0], watched.rate[:-1, 0]
+    value = watched.value[:-1, 0]
+    return value, watched.rate[:-1, 0]

@@ -143,7 +143,8 @@ def _interpolation(
         return np.exp(1j * np.pi * x)
 
     # Their mean exponent, s = 1/2, is taken out: the others turn half as fast.
-    return f, coarse, mix * turn(coarse) * turn(-f)[:, None]
+    from_coarse = mix * turn(coarse)
+    return f, coarse, from_coarse * turn(-f)[:, None]
 
 
 @one_program
@@ -168,11 +169,13 @@ def _transfer(
     # The input's wave at the nodes of each piece, relative to its beginning. Columns are responses
     # to inputs, then to states at phase 0.
     phase = flow.length[:, None] * rule().nodes / map.expected
-    inside = xp.exp(phase[..., None] * (2j * np.pi * coarse))
+    rates = 2j * np.pi * coarse
+    inside = xp.exp(phase[..., None] * rates)
     begin, delay, end = flow.driven(inside)
     H = _integrals(map, flow, z, harmonics, inside, begin, delay)
 
-    H = xp.concatenate([H, xp.moveaxis(end, -1, 0)], axis=1)
+    of_end = xp.moveaxis(end, -1, 0)
+    H = xp.concatenate([H, of_end], axis=1)
     at_f = fine @ H.reshape(len(coarse), -1)
     at_f = at_f.reshape(len(f), rows + d, -1)
     H, end = xp.split(at_f, [rows], axis=1)
@@ -181,9 +184,11 @@ def _transfer(
     size = map.sizes
     column = size[:, None]
     scaled = whole * size / column
-    back_a_period = xp.exp(-2j * np.pi * f)[:, None, None]
+    turns = -2j * np.pi * f
+    back_a_period = xp.exp(turns)[:, None, None]
     turned = xp.eye(d) - back_a_period * scaled
-    start = solve(turned, end[..., :nu] / column) * column
+    right = end[..., :nu] / column
+    start = solve(turned, right) * column
     by_input = H[..., :nu]
     by_start = H[..., nu:]
     H = by_input + by_start @ start
@@ -239,16 +244,19 @@ def _integrals(
     free = free.reshape(P, -1, K) @ back
     free = free.reshape(P, rows, d, -1).transpose(3, 1, 0, 2)
     free = free.reshape(-1, rows, P * d)
-    begins = xp.moveaxis(begin, -1, 0).reshape(-1, P * d, nu + d)
+    by_line = xp.moveaxis(begin, -1, 0)
+    begins = by_line.reshape(-1, P * d, nu + d)
     of_begin = free @ begins
 
     # By inputs within pieces.
     pushed = by_state @ flow.pushed.reshape(P, K, d, -1)
     pushed = pushed.reshape(*by_input.shape, K)
-    at_once = by_input[..., None] * xp.eye(K)[:, None, None]
+    unit = xp.eye(K)[:, None, None]
+    at_once = by_input[..., None] * unit
     pushed = (pushed + at_once).reshape(P, -1, K) @ inside
     pushed = pushed.reshape(P, K, -1, inside.shape[2])
-    pushed = (pushed * back[:, :, None]).reshape(P * K, -1)
+    turned_back = pushed * back[:, :, None]
+    pushed = turned_back.reshape(P * K, -1)
     forced = weighted.reshape(-1, P * K) @ pushed
     forced = forced.reshape(rows, nu, -1)
     forced = xp.pad(forced, [(0, 0), (0, d), (0, 0)])
@@ -256,7 +264,8 @@ def _integrals(
     # Events whose time moves: the jump of the output at the moment of the event.
     after_event = xp.roll(values[:, 0], -1, axis=0)
     jump = values[:, -1] - after_event
-    jumps = (waves[:, None, :, -1] * jump.T).reshape(rows, P)
+    at_ends = waves[:, None, :, -1]
+    jumps = (at_ends * jump.T).reshape(rows, P)
     moved = jumps @ delay.reshape(P, -1)
     of_inputs = forced + moved.reshape(forced.shape)
     return of_begin + xp.moveaxis(of_inputs, -1, 0)

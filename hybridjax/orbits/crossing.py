@@ -101,7 +101,8 @@ class Crossing(Definition):
     ) -> Float[Array, ""]:
         """The level of one state of chart a: it falls through zero at the section."""
         if isinstance(self.signal, str | Output):
-            value = s.resolve_outputs(self.signal)(a, t, q, jnp.zeros(s.nu))[0]
+            no_input = jnp.zeros(s.nu)
+            value = s.resolve_outputs(self.signal)(a, t, q, no_input)[0]
         else:
             value = jnp.asarray(self.signal(t, q), float)
         return (1.0 if self.direction == "falling" else -1.0) * (value - self.value)

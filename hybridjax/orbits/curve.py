@@ -99,7 +99,8 @@ class Point:
     @property
     def scaled(self) -> Float[np.ndarray, "d n"]:
         """Derivatives of the residual, all in sizes."""
-        return self.turn.jacobian * self.size / self.size[:-1, None]
+        by_column = self.turn.jacobian * self.size
+        return by_column / self.size[:-1, None]
 
     @ft.cached_property
     def multipliers(self) -> Complex[np.ndarray, " d"]:
@@ -168,7 +169,8 @@ class Curve:
         )
         if isinstance(point, Result):
             return point
-        astray = np.linalg.norm((point.z - last.z - ahead) / last.size)
+        off = point.z - last.z - ahead
+        astray = np.linalg.norm(off / last.size)
         return point if astray <= 0.5 * length else Result.NOT_CONVERGED
 
     def between(self, a: Point, b: Point, where: float) -> Point | Result:
@@ -251,7 +253,8 @@ class Curve:
                 steps=k,
             )
             equations = np.vstack([point.scaled, row * size])
-            residual = np.append(turn.residual / size[:-1], row @ (z - z0))
+            along = row @ (z - z0)
+            residual = np.append(turn.residual / size[:-1], along)
             (change,) = newton_steps(equations[None], residual[None], rounding)
             length = np.linalg.norm(change)
             only_rounding = length <= _ROUNDING and length >= 0.5 * last
@@ -297,7 +300,8 @@ class Curve:
         ranges = self._ranges(point.turn.pieces)
         if self.map.base is not None and np.max(ranges) <= self.least_range:
             return Result.EQUILIBRIUM
-        sizes = scale[int(point.anchor.chart[0])] * np.maximum(ranges, _LEAST_RANGE)
+        widest = np.maximum(ranges, _LEAST_RANGE)
+        sizes = scale[int(point.anchor.chart[0])] * widest
         point = dataclasses.replace(point, size=np.append(sizes, self.span))
         _, _, right = np.linalg.svd(point.scaled)
         same = right[-1] @ point.tangent >= 0

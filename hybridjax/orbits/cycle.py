@@ -209,7 +209,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         if strong and has_implicit(self.structure):
             values = self._without_lost(values)
         # Of each conserved quantity one is known.
-        near_one = np.argsort(np.abs(values - 1))[: len(self.conserved)]
+        order = np.argsort(np.abs(values - 1))
+        near_one = order[: len(self.conserved)]
         values[near_one] = 1
         values = values[np.argsort(-np.abs(values), kind="stable")]
         values.flags.writeable = False  # they are kept
@@ -221,7 +222,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         scale = np.asarray(self.settings.scale)[np.asarray(self.pieces.chart)]
         after = np.roll(np.arange(len(dims)), -1)
         factors = np.asarray(self.factors)
-        factors = factors * scale[:, None, :] / scale[after, :, None]
+        scaled = factors * scale[:, None, :]
+        factors = scaled / scale[after, :, None]
         return [
             factor[: dims[end], : dims[begin]]
             for begin, (end, factor) in enumerate(zip(after, factors, strict=True))
@@ -249,7 +251,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         with np.errstate(divide="ignore"):
             logs = np.log(np.abs(self.multipliers))
         if not self.event_sequence and np.sum(np.isneginf(logs)) == 1:
-            logs[-1] = log_determinant(self) - np.sum(logs[:-1])
+            others = np.sum(logs[:-1])
+            logs[-1] = log_determinant(self) - others
         return logs
 
     @property
@@ -279,14 +282,16 @@ class LimitCycle(WithMultipliers, eqx.Module):
         """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
         belong to conserved quantities."""
         inside = np.abs(self.multipliers) < 1
-        return bool(np.sum(inside) == len(inside) - len(self.conserved))
+        free = len(inside) - len(self.conserved)
+        return bool(np.sum(inside) == free)
 
     @property
     def state(self) -> dict[str, float]:
         """The state at `anchor`, by name."""
         _require_values(self, "state")
         anchor = to_host(self.anchor)
-        return self.structure.by_name(int(anchor.chart[0]), anchor.q[:, 0])
+        chart = int(anchor.chart[0])
+        return self.structure.by_name(chart, anchor.q[:, 0])
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot.
@@ -584,7 +589,9 @@ def _differ(x: Any, y: Any) -> bool:
     # (A parameter alone is traced, if it was replaced inside of a transformation.)
     if is_tracer(x) or is_tracer(y):
         return not is_tracer(y)
-    return x is not y and np.asarray(x).tobytes() != np.asarray(y).tobytes()
+    if x is y:
+        return False
+    return np.asarray(x).tobytes() != np.asarray(y).tobytes()
 
 
 def orbit_picture(
@@ -619,7 +626,8 @@ def orbit_picture(
     for a in np.unique(chart):
         name = s.names[a] if len(s.names) > 1 else ""
         color = CHARTS[a % len(CHARTS)]
-        curves.append(Curve(np.where(chart == a, x, np.nan), y, name, color))
+        in_chart = np.where(chart == a, x, np.nan)
+        curves.append(Curve(in_chart, y, name, color))
     if sections is not None:
         x, y = axes(*sections)
         curves.append(Curve(x, y, color="currentColor", points=True))
@@ -673,7 +681,8 @@ def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], M
         elif at_once:  # (there is no flow before it)
             basis = np.eye(1 + n)[:, 1:]
         else:
-            _, _, directions = np.linalg.svd(field[None, :n] / sizes)
+            scaled = field[None, :n] / sizes
+            _, _, directions = np.linalg.svd(scaled)
             across = directions[1:].T
             basis = np.pad(across, [(1, 0), (0, 0)])
         frames.append((np.append(map.expected, sizes), basis))

@@ -638,7 +638,8 @@ def _with_distance_in(solution: Solution, map: ReturnMap, fine: ReturnMap) -> So
     after = to_host(fine).sizes
     # (Gaps between moves are part of the distance, too.)
     gap = np.asarray(turn.distance) - np.max(residual / before)
-    distance = np.max(residual / after) + gap * np.max(before / after)
+    by_gap = gap * np.max(before / after)
+    distance = np.max(residual / after) + by_gap
     return solution._replace(turn=turn._replace(distance=real(distance)))
 
 

@@ -114,7 +114,8 @@ class Fluctuations(Showable, eqx.Module):
         deviations = np.sqrt(np.diag(self.durations()))
         for a, b, x in zip(before, self.events, deviations, strict=False):
             rows.append(f"{number(x, 6, unit)}: standard deviation from {a} to {b}")
-        return f"Fluctuations({name})" + "".join(f"\n  {row}" for row in rows)
+        lines = "".join(f"\n  {row}" for row in rows)
+        return f"Fluctuations({name})" + lines
 
 
 def fluctuations(
@@ -167,7 +168,8 @@ def _noisy(
     d = flow.q.shape[-1]
 
     # One turn without fluctuations at its beginning.
-    (turn, noise), (begin, *_) = _around(pieces, xp.zeros((n, n)))
+    none = xp.zeros((n, n))
+    (turn, noise), (begin, *_) = _around(pieces, none)
     valid = xp.append(map.valid, xp.ones(n - d, bool))
     turn = xp.where(valid[:, None], turn, 0.0)
     field = flow.field[0, 0]
@@ -175,7 +177,8 @@ def _noisy(
     diffusion = _diffusion(map, phase, noise[:d, :d])
 
     # (A state ahead of the cycle meets the next events earlier.)
-    ahead = xp.concatenate([-field, xp.ones(1), xp.zeros(n - d - 1)])
+    no_noise = xp.zeros(n - d - 1)
+    ahead = xp.concatenate([-field, xp.ones(1), no_noise])
     wide_phase = xp.append(phase, xp.zeros(n - d))
     across = xp.eye(n) + ahead[:, None] * wide_phase
     step = across @ turn
@@ -195,7 +198,8 @@ def _noisy(
     sizes = map.scale[flow.chart]
     free, _ = flow.forward
     from_begin = across_nodes @ free @ begin[:, None, :d, :d]
-    to_section = across[:d, :d] @ xp.swapaxes(to_end, -1, -2)
+    to_end_by_row = xp.swapaxes(to_end, -1, -2)
+    to_section = across[:d, :d] @ to_end_by_row
     return Fluctuations(
         diffusion,
         tuple(names),
@@ -259,8 +263,10 @@ def _pieces(
     E = events.slot.shape[-1]
     n = d + 1 + E
     turned = xp.swapaxes(flow.adjoint, -1, -2) @ columns
-    weight = (flow.length[:, None] * rule().weights)[..., None, None]
-    collected = xp.sum(weight * turned @ xp.swapaxes(turned, -1, -2), axis=1)
+    weights = flow.length[:, None] * rule().weights
+    weight = weights[..., None, None]
+    square = weight * turned @ xp.swapaxes(turned, -1, -2)
+    collected = xp.sum(square, axis=1)
     free, _ = flow.forward
     stays = np.arange(n) >= d
     forward = _pad(free[:, -1], n) + np.diag(stays)
@@ -276,7 +282,8 @@ def _pieces(
             [each * delay, -1.0 * each, (1.0 - each) * np.eye(E)],
         ]
     )
-    by_delay = xp.concatenate([flow.jumps.slip, xp.ones((P, 1)), events.slot], axis=1)
+    ones = xp.ones((P, 1))
+    by_delay = xp.concatenate([flow.jumps.slip, ones, events.slot], axis=1)
     late = events.delay_by_noise[:, None] * by_delay
     deviations = xp.asarray(scatter)[flow.event]
     scattered = deviations[:, :, None] ** 2 * np.eye(d)
@@ -360,7 +367,8 @@ def _largest_difference(
 ) -> Float[Array, ""]:
     """Largest difference of covariances at the ends of pieces, relative to those on the cycle."""
     xp = namespace(ends)
-    difference = xp.max(xp.abs(at_nodes[:, -1] - ends), axis=0)
+    apart = xp.abs(at_nodes[:, -1] - ends)
+    difference = xp.max(apart, axis=0)
     variance = xp.abs(xp.diagonal(at_nodes, axis1=2, axis2=3))
     size = xp.sqrt(xp.max(variance, axis=(0, 1)))
     products = size[:, None] * size
@@ -412,7 +420,8 @@ def _rounding(
 def _pad(x: Float[Array, "*P d d"], n: int) -> Float[Array, "*P n n"]:
     """Matrices with zeros for further rows and columns."""
     more = n - x.shape[-1]
-    return namespace(x).pad(x, [(0, 0)] * (x.ndim - 2) + [(0, more), (0, more)])
+    kept = [(0, 0)] * (x.ndim - 2)
+    return namespace(x).pad(x, kept + [(0, more), (0, more)])
 
 
 def _columns(

@@ -101,7 +101,8 @@ def return_map_near(
     given_period = s.system.period()
     period = None if given_period is None else float(given_period)
     a = int(lane.chart[0])
-    near = sizes_near(s, a, lane.t[0], lane.q[:, 0], period)
+    state = lane.q[:, 0]
+    near = sizes_near(s, a, lane.t[0], state, period)
     settings = dataclasses.replace(settings, scale=scale_of(s, near.sizes | given))
     charts = np.arange(len(s.charts))
     times = np.repeat(lane.t, len(charts))
@@ -153,7 +154,8 @@ def _check_field(s: Structure, guess: Guess, lane: Lanes) -> None:
     a = int(lane.chart[0])
     u = np.zeros((s.nu, 1))
     q = lane.q[: s.dims[a]]
-    rate = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    rows = kernels.field(s, a, lane.t, q, u)
+    rate = rows[:, 0, 0]
     if not np.isfinite(rate).all():
         raise DefinitionError(
             f"the field of chart '{guess.chart}' at the guess, {guess.state}, is {rate}: start "
@@ -171,7 +173,8 @@ def _settled(map: ReturnMap, settle: float, period: float | None) -> ReturnMap:
     end = np.asarray(lanes.t) + wait
     lanes = _go(map, "settling", lanes, toward(end, -1, end))
     if period is not None:
-        lanes = lanes._replace(t=real(np.asarray(lanes.t) - wait))
+        begin = np.asarray(lanes.t) - wait
+        lanes = lanes._replace(t=real(begin))
     return dataclasses.replace(map, anchor=lanes)
 
 
@@ -181,7 +184,8 @@ def _patience(map: ReturnMap, lanes: Lanes) -> float:
     lane = to_host(lanes)
     a = int(lane.chart[0])
     t = float(lane.t[0])
-    near = sizes_near(s, a, t, lane.q[:, 0], None)
+    state = lane.q[:, 0]
+    near = sizes_near(s, a, t, state, None)
     return _PATIENCE * max(near.time, slow_time(s, t, near.points))
 
 
@@ -192,7 +196,8 @@ def _time_of_motion(map: ReturnMap, lanes: Lanes) -> float:
     a = int(lane.chart[0])
     q = lane.q[: s.dims[a]]
     u = np.zeros((s.nu, 1))
-    rates = kernels.field(s, a, lane.t, q, u)[:, 0, 0]
+    rows = kernels.field(s, a, lane.t, q, u)
+    rates = rows[:, 0, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         times = np.abs(q[:, 0] / rates)
     return float(np.nanmin(times, initial=np.inf))
@@ -203,7 +208,8 @@ def _decays(map: ReturnMap, lanes: Lanes) -> bool:
     s = map.structure
     lane = to_host(lanes)
     a = int(lane.chart[0])
-    (rate,) = fastest(s, a, lane.t, lane.q[: s.dims[a]])
+    state = lane.q[: s.dims[a]]
+    (rate,) = fastest(s, a, lane.t, state)
     return bool(rate > 0)
 
 
@@ -228,7 +234,8 @@ def _on_section(
     lanes = map.anchor
     a = int(np.asarray(lanes.chart)[0])
     q = np.asarray(lanes.q)[: s.dims[a], 0]
-    f, level, rate = jax.device_get(_at_anchor(dataclasses.replace(map, base=section)))
+    with_section = dataclasses.replace(map, base=section)
+    f, level, rate = jax.device_get(_at_anchor(with_section))
     f = f[: s.dims[a]]
     if not f.any():
         raise ComputationError(
@@ -237,7 +244,8 @@ def _on_section(
         )
     place = str(section)
     advice = ""
-    on_section = rate < 0 and abs(level) <= -SAME * time * rate  # up to rounding
+    rounding = -SAME * time * rate
+    on_section = rate < 0 and abs(level) <= rounding  # up to rounding
     if isinstance(section, AtEvent):
         on_section = is_after
     if section is None:
@@ -259,7 +267,8 @@ def _on_section(
         if is_default(section) and _misses(moved) and not last:
             say("a section where the flow has led")
             # (A search that is given up may end at an event.)
-            end = np.asarray(moved.lanes.t) + _ONWARD * _patience(map, moved.lanes)
+            longest = _ONWARD * _patience(map, moved.lanes)
+            end = np.asarray(moved.lanes.t) + longest
             onward = _go(map, "settling", moved.lanes, toward(end, -1, end))
             later = dataclasses.replace(at_guess, anchor=onward)
             return _on_section(later, None, False, time, max_period, last=True)
@@ -270,8 +279,10 @@ def _on_section(
 
 def _across(map: ReturnMap, a: int, q: np.ndarray, f: np.ndarray) -> Crossing:
     """The plane through a state of chart a that is orthogonal to the field there, in sizes."""
-    sizes = np.asarray(map.scale)[a, : len(q)]
-    normal = f / sizes**2 / np.linalg.norm(f / sizes)
+    scale = np.asarray(map.scale)
+    sizes = scale[a, : len(q)]
+    length = np.linalg.norm(f / sizes)
+    normal = f / sizes**2 / length
     plane = _Plane(real(q), real(normal))
     return Crossing(plane, "rising", charts=(map.structure.names[a],))
 
@@ -303,9 +314,11 @@ def _next_crossing(
     begin = float(np.asarray(lanes.t)[0])
     for _ in range(_LOOKS):
         no_time = np.full(1, np.inf)
-        target = toward(no_time, -1, np.asarray(lanes.t) + wait)
+        last = np.asarray(lanes.t) + wait
+        target = toward(no_time, -1, last)
         moved = _moved(map, lanes, to_section(target, section, map.event))
-        waited = float(np.asarray(moved.lanes.t)[0]) - begin
+        end = float(np.asarray(moved.lanes.t)[0])
+        waited = end - begin
         if not _misses(moved) or max_period is not None:
             break
         # (The states may have become slower than they were at the guess, or drift away.)
@@ -322,7 +335,8 @@ def _next_crossing(
     if _misses(moved):
         _require_motion(map, moved.lanes)
         s = map.structure
-        doubts = begins_beyond(s, to_host(map.anchor), np.zeros((s.nu, 1)))
+        no_input = np.zeros((s.nu, 1))
+        doubts = begins_beyond(s, to_host(map.anchor), no_input)
         causes = [f"One cause may be that {x.text} " for x in doubts]
         late = "".join(causes) or late
     return moved, late
@@ -342,16 +356,19 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     code = np.asarray(tape.code)[:, 0]
     follows = np.asarray(tape.at_once)[:, 0]
     # (A section at an event that another one follows at once is refused.)
-    happens = (code >= 0) & ~np.append(follows[1:], False)
+    is_followed = np.append(follows[1:], False)
+    happens = (code >= 0) & ~is_followed
     if not happens.any():
         return None
-    counts = np.bincount(code[code >= 0], minlength=len(s.transitions))
+    happened = code[code >= 0]
+    counts = np.bincount(happened, minlength=len(s.transitions))
     g = min(np.unique(code[happens]).tolist(), key=lambda g: counts[g])
     row = np.flatnonzero(happens & (code == g))[-1]
     a = int(tape.chart[row, 0])
     state = np.asarray(tape.after)[row, : s.dims[a], 0]
     name = s.transitions[g].name
-    return Guess(s.names[a], state, time=float(tape.t[row, 0]), after=name)
+    time = float(tape.t[row, 0])
+    return Guess(s.names[a], state, time=time, after=name)
 
 
 def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
@@ -363,17 +380,21 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
     moves = recorded_moves(pieces, tape)
     lane, row = np.nonzero(tape.code.T != IDLE)
     ends = tape.before[row, :, lane].T
-    f = slopes(s, pieces.t, pieces.chart, pieces.q, np.zeros((s.nu, 1)))
+    no_input = np.zeros((s.nu, 1))
+    f = slopes(s, pieces.t, pieces.chart, pieces.q, no_input)
     (begins,) = np.nonzero(moves.order == 0)
     for k in range(1, len(pieces.t)):
         a = int(pieces.chart[k])
         n = s.dims[a]
-        plane = _across(map, a, pieces.q[:n, k], f[:n, k])
+        state = pieces.q[:n, k]
+        plane = _across(map, a, state, f[:n, k])
         signal: Any = plane.signal
         point = np.asarray(signal.point)
         normal = np.asarray(signal.normal)
-        before = normal @ (moves.q[:n] - point[:, None])
-        after = normal @ (ends[:n] - point[:, None])
+        from_point = moves.q[:n] - point[:, None]
+        before = normal @ from_point
+        to_point = ends[:n] - point[:, None]
+        after = normal @ to_point
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)
         # (It meets the plane where the piece begins, with the move before and that after.)
         meets[begins[k] - 1 : begins[k] + 1] = False
@@ -392,9 +413,11 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     t = lane.t
     n = s.dims[a]
     u = np.zeros((s.nu, 1))
-    field = kernels.field(s, a, t, lane.q[:n], u)[..., 0]
+    rows = kernels.field(s, a, t, lane.q[:n], u)
+    field = rows[..., 0]
     scale = np.asarray(map.scale)[a, :n]
-    sizes = np.maximum(np.abs(lane.q[:n, 0]), scale)
+    magnitude = np.abs(lane.q[:n, 0])
+    sizes = np.maximum(magnitude, scale)
     rate = field[:, 0] / sizes
     by_state = field[:, 2 : 2 + n]
     jacobian = by_state * sizes / sizes[:, None]
@@ -404,7 +427,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
         return
     # (A state that drifts at a constant rate is near none.)
     drift = rate - jacobian @ distance
-    if np.abs(drift).max() > 0.1 * np.abs(rate).max():
+    largest = np.abs(rate).max()
+    if np.abs(drift).max() > 0.1 * largest:
         return
     beyond = []
     guards = s.guards(a)
@@ -420,7 +444,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
     # (The equilibrium is known to a part of the sizes: what is less is zero.)
-    known = np.abs(lane.q[:n, 0]) > _REST * scale
+    magnitude = np.abs(lane.q[:n, 0])
+    known = magnitude > _REST * scale
     place = np.where(known, lane.q[:n, 0], 0.0)
     place = signal_values(s.states(a), place)
     raise ComputationError(
@@ -432,9 +457,12 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
 @host_first
 def _at_anchor(map: ReturnMap):
     """The field (d,), and the value and rate of the level of a crossing."""
-    watched = map.watch(map.anchor, to_section(until(map.anchor.t), map.base, -1))
+    section = to_section(until(map.anchor.t), map.base, -1)
+    watched = map.watch(map.anchor, section)
     slope = map.slopes(map.anchor)[:, 0]
-    return slope, watched.value[-1, 0], watched.rate[-1, 0]
+    value = watched.value[-1, 0]
+    rate = watched.rate[-1, 0]
+    return slope, value, rate
 
 
 def _go(map: ReturnMap, doing: str, lanes: Lanes, target: Target) -> Lanes:

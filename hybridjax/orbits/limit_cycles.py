@@ -155,7 +155,8 @@ class LimitCycles(Showable, eqx.Module):
     @remembered
     def _multipliers(self) -> Complex[np.ndarray, "S d"]:
         products = turn_product(np.asarray(self.factors))
-        values = np.linalg.eigvals(np.where(self.ok[:, None, None], products, 0.0))
+        found = np.where(self.ok[:, None, None], products, 0.0)
+        values = np.linalg.eigvals(found)
         moduli = np.round(np.abs(values), 12)
         order = np.lexsort((-np.imag(values), -moduli), axis=-1)
         values = np.take_along_axis(values.astype(complex), order, axis=-1)
@@ -173,7 +174,8 @@ class LimitCycles(Showable, eqx.Module):
         return folded("; ".join(text))
 
     def __repr__(self):
-        return folded(f"LimitCycles({type(self.systems).__name__}: {self.summary(1)})")
+        kind = type(self.systems).__name__
+        return folded(f"LimitCycles({kind}: {self.summary(1)})")
 
 
 @checked
@@ -377,7 +379,8 @@ def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
     width = max(codes.shape[1], more.shape[1])
 
     def fill(x):
-        return np.pad(x, ((0, 0), (0, width - x.shape[1])), constant_values=-1)
+        missing = width - x.shape[1]
+        return np.pad(x, ((0, 0), (0, missing)), constant_values=-1)
 
     return np.maximum(fill(codes), fill(more))
 
@@ -511,7 +514,8 @@ def examined(
 
 def _spread(rows: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
     """Eight of some rows, or all if they are fewer."""
-    places = np.linspace(0, len(rows) - 1, min(len(rows), _TESTED))
+    number = min(len(rows), _TESTED)
+    places = np.linspace(0, len(rows) - 1, number)
     return rows[np.unique(places.astype(int))]
 
 
@@ -554,6 +558,8 @@ def rough(cycle: LimitCycle) -> dict[str, Any]:
     chart = int(np.asarray(cycle.anchor.chart)[0])
     q = np.asarray(cycle.anchor.q)[:, 0]
     size = np.asarray(cycle.settings.scale)[chart]
-    state = [f"{x:.4f}" for x in (q / size).round(4) + 0.0]
-    period, time = (f"{float(x):.5g}" for x in (cycle.period, cycle.anchor.t[0]))
+    scaled = (q / size).round(4) + 0.0
+    state = [f"{x:.4f}" for x in scaled]
+    times = (cycle.period, cycle.anchor.t[0])
+    period, time = (f"{float(x):.5g}" for x in times)
     return {"period": period, "time": time, "chart": chart, "state": state}

@@ -163,7 +163,8 @@ class LinearFlow(eqx.Module):
         h = self.length[:, None, None, None, None]
         whole = D[:, None, :, None] * same_state
         whole = whole + sign * h * field
-        inverse = solve(whole.reshape(-1, n * d, n * d), np.eye(n * d))
+        right = np.eye(n * d)
+        inverse = solve(whole.reshape(-1, n * d, n * d), right)
         inverse = inverse.reshape(-1, n, d, n, d)
         return inverse * ratio[:, None, :, None, :]
 
@@ -178,7 +179,8 @@ class LinearFlow(eqx.Module):
         free = -xp.einsum("piajb,j->piab", inverse, by_first)
         unit = xp.broadcast_to(xp.eye(d), (len(free), 1, d, d))
         free = xp.concatenate([unit, free], axis=1)
-        forced = xp.pad(inverse, [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)])
+        widths = [(0, 0), (1, 0), (0, 0), (1, 0), (0, 0)]
+        forced = xp.pad(inverse, widths)
         return free, forced
 
     @remembered
@@ -202,7 +204,8 @@ class LinearFlow(eqx.Module):
             return free @ before, before
 
         # From the last piece to the first.
-        pieces = (self.jumps.by_state[::-1], self.adjoint[::-1, 0])
+        across = self.jumps.by_state[::-1]
+        pieces = (across, self.adjoint[::-1, 0])
         _, ends = scan(back, end, pieces)
         return self.adjoint @ ends[::-1, None]
 
@@ -246,7 +249,8 @@ class LinearFlow(eqx.Module):
 
         def wide(x):
             """With columns of zeros for the deviations at the beginning of the turn."""
-            return xp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, d), (0, 0)])
+            kept = [(0, 0)] * (x.ndim - 2)
+            return xp.pad(x, kept + [(0, d), (0, 0)])
 
         # Deviations at the ends of pieces, before their events.
         pushed_at_end = self.pushed[:, -1].reshape(P, -1, K)
@@ -254,7 +258,8 @@ class LinearFlow(eqx.Module):
 
         # The same after the events.
         last = waves[:, -1, None]
-        jumped = (jumps.by_state @ arrived.reshape(P, d, -1)).reshape(P, d, nu, f)
+        columns = arrived.reshape(P, d, -1)
+        jumped = (jumps.by_state @ columns).reshape(P, d, nu, f)
         jumped = jumped + jumps.by_input[..., None] * last[:, None]
         kick = wide(jumped)
 
@@ -266,7 +271,8 @@ class LinearFlow(eqx.Module):
         own = xp.pad(xp.eye(d), [(0, 0), (nu, 0)])
         begin = own[..., None] + 0 * kick[0]
         through = xp.asarray(self.through, dtype=waves.dtype)
-        end, x = scan(advance, begin, (through, kick, 1 / last[:, 0]))
+        one_over_wave = 1 / last[:, 0]
+        end, x = scan(advance, begin, (through, kick, one_over_wave))
 
         # The delays of events.
         free, _ = self.forward
@@ -347,7 +353,8 @@ def begin_later(cycle: Any, k: int) -> Any:
         q=lanes.q[:, :1],
     )
     guess = dataclasses.replace(cycle, anchor=anchor)
-    turn = lanes._replace(t=lanes.t + later), tape._replace(t=tape.t + later)
+    later_tape = tape._replace(t=tape.t + later)
+    turn = lanes._replace(t=lanes.t + later), later_tape
     _turns.recall(hosted(guess), None, lambda: turn)
     return guess
 
@@ -417,13 +424,15 @@ def _pieces(
     event = np.maximum(moves.code[last], -1)
 
     # Each of these is divided into equal parts. (Rounding divides no piece.)
-    count = np.ceil(np.real(length[:, 0]) / longest - 1e-9)
+    number = np.real(length[:, 0]) / longest
+    count = np.ceil(number - 1e-9)
     count = np.maximum(count, 1).astype(int)
     whole = np.repeat(np.arange(len(first)), count)
     parts_before = np.cumsum(count) - count
     part = np.arange(len(whole)) - np.repeat(parts_before, count)
     parts = count[whole]
-    share = (part[:, None] + rule().nodes) / parts[:, None]
+    place = part[:, None] + rule().nodes
+    share = place / parts[:, None]
     begin = t[first][whole]
     duration = length[whole]
     is_last = part == parts - 1
@@ -491,13 +500,7 @@ def _linear_flow(
         return np.moveaxis(x, (-1, -3, -2), (0, 1, 2))
 
     states = lay(states)
-    # Ends of pieces: by direction and piece.
-    u = kernels.unpushed(of, 1 + d + np.repeat(np.arange(directions), P))
-    events = np.tile(pieces.event, directions)
-    times_of_ends = pieces.time[:, -1].T.ravel()
-    states_at_ends = states[:, :, -1].reshape(-1, d)
-    jumps = _jumps(of, events, times_of_ends, u, states_at_ends)
-    jumps = Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
+    jumps = _jumps_at_ends(of, pieces, states[:, :, -1])
     flow = LinearFlow(
         t=lay(times),
         length=pieces.length.T,
@@ -514,6 +517,19 @@ def _linear_flow(
         return jax.tree_util.tree_map(lambda x: x.imag / kernels.TINY, flow)
     flow = jax.tree_util.tree_map(lambda x: x[0], flow)
     return dataclasses.replace(flow, chart=chart, event=pieces.event)
+
+
+def _jumps_at_ends(
+    of: Structure, pieces: _Pieces, states: Inexact[np.ndarray, "directions P d"]
+) -> Jumps:
+    """The jumps at the ends of pieces, by direction and piece, from the states before them."""
+    directions, P, d = states.shape
+    direction = np.repeat(np.arange(directions), P)
+    u = kernels.unpushed(of, 1 + d + direction)
+    events = np.tile(pieces.event, directions)
+    times = pieces.time[:, -1].T.ravel()
+    jumps = _jumps(of, events, times, u, states.reshape(-1, d))
+    return Jumps(*(x.reshape(directions, P, *x.shape[1:]) for x in jumps))
 
 
 def _step_at(moves: Moves, pieces: _Pieces) -> Int[np.ndarray, "P K"]:
@@ -609,7 +625,8 @@ def _jumps(s: Structure, code, t, u, q) -> Jumps:
         now = np.flatnonzero(code == g)
         source = s.transitions[g].source
         n = s.dims[s.chart_index(source)]
-        event = jump(s, g, t[now], q[now, :n], u[:, now])
+        state = q[now, :n]
+        event = jump(s, g, t[now], state, u[:, now])
         m = event.after.shape[1]
         out.by_state[now] = 0.0
         out.by_state[now, :m, :n] = event.saltation

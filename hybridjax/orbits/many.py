@@ -82,7 +82,8 @@ class Many(NamedTuple):
         """Newton's method for some systems on a route, from states and ends of legs."""
         itinerary = route.finer if finer else route.first
         found: Corrected = self._in_tiles(_correct, route, itinerary, rows, q, ends)
-        code = np.array(judge(route, found, self.t[rows], self.expected[rows]))
+        codes = judge(route, found, self.t[rows], self.expected[rows])
+        code = np.array(codes)
         good = np.flatnonzero(code == Result.OK)
         if len(good):
             start = found.q[good], found.passage.ends[good]
@@ -166,11 +167,13 @@ class Solver:
             self._take(number)
         for _ in range(_SEARCHES + 1 - len(self.routes)):
             known = np.flatnonzero(self.found.path >= 0)
-            if not len(self.pending) or len(known) < _WORTH * len(self.found.path):
+            are_few = len(known) < _WORTH * len(self.found.path)
+            if not len(self.pending) or are_few:
                 return
             distance, near = self.nearest(self.pending, known)
             first = np.argmin(distance)
-            map = self._search(int(self.pending[first]), int(near[first]), self)
+            first_near = int(near[first])
+            map = self._search(int(self.pending[first]), first_near, self)
             if map is None:
                 return
             before = len(self.pending)
@@ -197,7 +200,8 @@ class Solver:
         expected = float(route.map.expected)
         q = np.repeat(route.map.anchor.q.T, len(rows), axis=0)
         grown = many.expected[rows] / expected
-        ends = many.t[rows, None] + route.first.ends * grown[:, None]
+        since = route.first.ends * grown[:, None]
+        ends = many.t[rows, None] + since
         for _ in range(_ROUNDS):
             attempt = many.attempt(route, rows, q, ends)
             self._keep(number, attempt)

@@ -123,7 +123,8 @@ def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
         turn = map.turn_with_jacobian(q, record=turn.record)
         result = map.judge(q, turn)
         # (Far from where a turn was recorded, other events happen than in its record.)
-        is_near = jnp.max(jnp.abs(q - begin) / map.sizes) <= CLOSED
+        apart = jnp.abs(q - begin) / map.sizes
+        is_near = jnp.max(apart) <= CLOSED
         is_fixed = (result == Result.OK) | (result == Result.SINGULAR)
         strays = is_fixed & ~is_near
         result = jnp.where(strays, jnp.int32(Result.NOT_CONVERGED), result)
@@ -145,13 +146,15 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     levels = None if ends.levels is None else ListLevels((by.base,))
     s = kernels.Tangents(map.structure, by.structure, ends.levels, levels, P)
     begin = np.zeros((1 + len(sizes), P))
-    begin[0] = 0.0 if by.anchor.t is None else by.anchor.t[:, 0]
+    if by.anchor.t is not None:
+        begin[0] = by.anchor.t[:, 0]
     longer = np.zeros(P) if by.expected is None else by.expected
     along = begin[0][:, None] + np.outer(
         longer, (ends.time - map.anchor.t) / map.expected
     )
     times = np.where(np.isfinite(ends.time), along, 0.0)
-    orbit = Variation(s, turn.pieces, ends, side_by_side(turn.tapes), times, factors)
+    tape = side_by_side(turn.tapes)
+    orbit = Variation(s, turn.pieces, ends, tape, times, factors)
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     end = orbit.tangents(begin)[-1, 1:].T
     moved = np.where(map.valid, end, 0.0) / sizes
@@ -160,15 +163,18 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     begin[1:] = (newton_steps(each, moved) * sizes).T
     tangents = orbit.tangents(begin)
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
-    moving = nothing.turn._replace(period=tangents[-1, 0] - begin[0])
+    longer_period = tangents[-1, 0] - begin[0]
+    moving = nothing.turn._replace(period=longer_period)
     if factors:
         pieces = turn.pieces
-        by_factor = orbit.jacobians(tangents)[..., 1:, 1 : 1 + len(sizes)]
+        by_all = orbit.jacobians(tangents)
+        by_factor = by_all[..., 1:, 1 : 1 + len(sizes)]
         if map.base is not None:
             f = slopes(s, *orbit.points(tangents, orbit.first)).T.reshape(
                 *by_factor.shape[:3]
             )
-            by_factor = across(f, map.scale[pieces.chart][:, None], by_factor)
+            sizes_of_charts = map.scale[pieces.chart][:, None]
+            by_factor = across(f, sizes_of_charts, by_factor)
         t_pieces = np.moveaxis(tangents[orbit.first], 0, -1)
         moving = moving._replace(
             pieces=moving.pieces._replace(
@@ -176,8 +182,11 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
             ),
             factors=np.moveaxis(by_factor.imag / kernels.TINY, 1, 0),
         )
-    t_anchor = None if by.anchor.t is None else begin[0][:, None]
-    anchor = nothing.anchor._replace(t=t_anchor, q=begin[1:].T[..., None])
+    t_anchor = None
+    if by.anchor.t is not None:
+        t_anchor = begin[0][:, None]
+    q = begin[1:].T[..., None]
+    anchor = nothing.anchor._replace(t=t_anchor, q=q)
     return solution, nothing._replace(anchor=anchor, turn=moving)
 
 
@@ -260,7 +269,9 @@ def _by_rough_turns(
     pieces = moves and follow_moves(
         map, map.departure(x * map.sizes), map.ends(), moves
     )
-    x, moves = fixed_point(map, pieces[::2], x) if pieces else (x, None)
+    moves = None
+    if pieces:
+        x, moves = fixed_point(map, pieces[::2], x)
     return x, moves, steps, turn
 
 
@@ -270,7 +281,9 @@ def _newton(
     """Newton's method from a state, in sizes, with the steps and the test of optimistix. The first
     turn makes the `moves` if they are right; `first` steps were taken before."""
     for steps in itertools.count(first + 1):
-        travelled = None if moves is None else travel(map, x * map.sizes, moves)
+        travelled = None
+        if moves is not None:
+            travelled = travel(map, x * map.sizes, moves)
         turn, step = _step_from(map, x, travelled)
         x = x + step
         # (Gaps between moves may be as large as errors of steps.)
@@ -287,7 +300,8 @@ def _newton(
         moves = None
         # (Later ones have not helped before.)
         if steps < FEW_STEPS:
-            x, moves = fixed_point(map, (turn.pieces, side_by_side(turn.tapes)), x)
+            recorded = (turn.pieces, side_by_side(turn.tapes))
+            x, moves = fixed_point(map, recorded, x)
     return x * map.sizes, turn, np.asarray(steps)
 
 
@@ -327,7 +341,8 @@ def _damped(map: ReturnMap) -> tuple[np.ndarray, Turn, np.ndarray]:
     # (Rough turns may fail where accurate ones do not.)
     useful = rough.residual <= _ROUGH or not np.isfinite(rough.residual)
     end = _descent(map, begin, damping, 0.0) if useful else rough
-    return end.x * map.sizes, end.turn, np.asarray(end.steps)
+    state = end.x * map.sizes
+    return state, end.turn, np.asarray(end.steps)
 
 
 def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _Descent:
@@ -356,12 +371,14 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
             break
         else:
             damping *= 4
-        jacobian[len(x) :] = np.sqrt(damping) * np.eye(len(x))
+        penalty = np.sqrt(damping) * np.eye(len(x))
+        jacobian[len(x) :] = penalty
         step = -np.linalg.lstsq(jacobian, error)[0]
         # (Short steps are at the end, or where none helps.)
         history.append(least)
         stalls = steps > STALLED and least > 0.9 * history[-1 - STALLED]
-        short = excess(x[None], step[None])[0] < 1
+        excess_of_step = excess(x[None], step[None])
+        short = excess_of_step[0] < 1
         work += _moves(turn)
         if least <= enough or short or stalls or work > _WORK:
             break
@@ -379,7 +396,8 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
 def _moves(turn: Turn) -> int:
     """Number of moves that a turn has taken."""
     assert turn.tapes is not None
-    return int(np.sum(np.asarray(turn.tapes.code) != IDLE))
+    is_move = np.asarray(turn.tapes.code) != IDLE
+    return int(np.sum(is_move))
 
 
 @eqx.filter_custom_jvp
@@ -443,5 +461,6 @@ def _residual(x, map: ReturnMap):
     """
     fixed = jax.lax.stop_gradient(x * map.sizes)
     turn = map.turn_with_jacobian(fixed)
-    residual = turn.residual + turn.jacobian @ (x * map.sizes - fixed)
+    moved = x * map.sizes - fixed
+    residual = turn.residual + turn.jacobian @ moved
     return residual / map.sizes, turn

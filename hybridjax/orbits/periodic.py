@@ -36,7 +36,8 @@ def has_period(
         n = s.dims[a]
         points = jax.vmap(lambda t, q, f=values: _with_rate(f, t, q))
         twice = jnp.concatenate([times, times + period])
-        both, rates = points(twice, jnp.tile(q[:n].T, (2, 1)))
+        states = jnp.tile(q[:n].T, (2, 1))
+        both, rates = points(twice, states)
         now, later = jnp.split(both, 2)
         rate, _ = jnp.split(rates, 2)
         here = (chart == a)[:, None]
@@ -73,5 +74,6 @@ def _schedules_fit(s: Structure, period: Float[Array, ""]) -> Bool[Array, ""]:
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):
             ratio = period / transition.guard.period
-            fit = fit & (jnp.abs(ratio - jnp.round(ratio)) < SAME_TIME * ratio)
+            off = jnp.abs(ratio - jnp.round(ratio))
+            fit = fit & (off < SAME_TIME * ratio)
     return fit

@@ -98,16 +98,21 @@ class Plan(eqx.Module):
         whether they have kept the itinerary, with steps that are fine enough."""
         xp = namespace(passage.t)
         ends = passage.ends
-        begins = xp.concatenate([begin[..., None], ends[..., :-1]], axis=-1)
+        first = begin[..., None]
+        begins = xp.concatenate([first, ends[..., :-1]], axis=-1)
         durations = ends - begins
         # (Rounding makes legs that last no time negative.)
-        forwards = durations >= -ROUNDING * period[..., None]
+        shortest = -ROUNDING * period[..., None]
+        forwards = durations >= shortest
         unused = np.arange(ends.shape[-1]) > self.last
-        kept = ~passage.left & (forwards | unused).all(axis=-1)
-        kept = kept & (passage.last <= _LAST_CORRECTION * period)
+        in_order = (forwards | unused).all(axis=-1)
+        kept = ~passage.left & in_order
+        has_converged = passage.last <= _LAST_CORRECTION * period
+        kept = kept & has_converged
+        is_fine = passage.error <= 1
         code = xp.zeros_like(passage.left, dtype=xp.int32)
         code = update_result(code, ~kept, Result.EVENT_ORDER)
-        return update_result(code, ~(passage.error <= 1), Result.STEP_LIMIT)
+        return update_result(code, ~is_fine, Result.STEP_LIMIT)
 
 
 def _number(x: Any) -> Array:
@@ -281,7 +286,8 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
     )
 
     def residual(map: ReturnMap, end, q):
-        return jnp.where(map.valid, end, 0.0) - q - map.held(q)[0]
+        returned = jnp.where(map.valid, end, 0.0)
+        return returned - q - map.held(q)[0]
 
     return passage, maps.each(residual, passage.q, q)
 
@@ -289,13 +295,17 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
 def _newton(map: ReturnMap, factors, residual, q):
     """The Jacobian of the residual, the Newton step, its size relative to the tolerance, and that
     of the residual in sizes of the states."""
-    product = jnp.where(map.valid[:, None], monodromy(factors), 0.0)
-    jacobian = product - jnp.eye(len(q)) - map.held(q)[1]
+    whole = monodromy(factors)
+    product = jnp.where(map.valid[:, None], whole, 0.0)
+    unit = jnp.eye(len(q))
+    jacobian = product - unit - map.held(q)[1]
     sizes = map.sizes
-    step = -solve_by_columns(jacobian * sizes / sizes[:, None], residual / sizes)
+    scaled = jacobian * sizes / sizes[:, None]
+    step = -solve_by_columns(scaled, residual / sizes)
     tolerance = ATOL + RTOL * jnp.abs(q / sizes)
     excess = jnp.max(jnp.abs(step) / tolerance)
-    return jacobian, step * sizes, excess, jnp.max(jnp.abs(residual) / sizes)
+    distance = jnp.max(jnp.abs(residual) / sizes)
+    return jacobian, step * sizes, excess, distance
 
 
 def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
@@ -319,7 +329,9 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         )
         found = jax.tree_util.tree_map(ft.partial(_where, settled), before, found)
         # (Once the tolerance is met, one more turn reaches rounding, where that is below.)
-        closed = (excess <= enough) | ((excess <= 1) & (before.excess <= 1))
+        is_small = excess <= enough
+        stays_small = (excess <= 1) & (before.excess <= 1)
+        closed = is_small | stays_small
         # (Where multipliers are zero, the state converges before the times of events do.)
         closed = closed & (passage.last <= _LAST_CORRECTION * maps.expected)
         return found, _where(settled, q, q + step), settled | closed
@@ -329,7 +341,8 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         return (~settled & (found.turns < MOST_TURNS)).any()
 
     # (A first turn before the loop would be compiled twice.)
-    begin = _nothing_yet(q, ends), q, jnp.zeros(q.shape[:-1], bool)
+    none = jnp.zeros(q.shape[:-1], bool)
+    begin = _nothing_yet(q, ends), q, none
     return jax.lax.while_loop(going, again, begin)[0]
 
 
@@ -342,7 +355,8 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     def zeros(*shape):
         return jnp.zeros((*lanes, *shape))
 
-    pieces = zeros(K), zeros(K, d), zeros(K, d), zeros(K, d, d)
+    factors = zeros(K, d, d)
+    pieces = zeros(K), zeros(K, d), zeros(K, d), factors
     inside = jnp.zeros(lanes, bool)
     passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
     unsolved = zeros() + jnp.inf
@@ -389,7 +403,8 @@ def _solved_jvp(primals, tangents):
         _, step, *_ = maps.each(_newton, factors, moved, q)
         return by_q + step, by_passage
 
-    by_q, by_passages = jax.lax.scan(along, jnp.zeros_like(q), length=2)
+    start = jnp.zeros_like(q)
+    by_q, by_passages = jax.lax.scan(along, start, length=2)
     by_passage = jax.tree_util.tree_map(lambda x: x[-1], by_passages)
     nothing = jax.tree_util.tree_map(lambda _: None, found)
     return found, nothing._replace(q=by_q, passage=by_passage)
@@ -471,7 +486,9 @@ def factors_across(
     def first(x):
         return xp.moveaxis(x, lanes, 0)
 
-    factors = across(first(passage.rates), first(sizes), first(passage.factors))
+    rates = first(passage.rates)
+    size = first(sizes)
+    factors = across(rates, size, first(passage.factors))
     return xp.moveaxis(factors, 0, lanes)
 
 
@@ -538,7 +555,8 @@ def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
         late = xp.abs(passage.t - (t + expected))
         return isolated & (late <= ROUNDING * expected)
     if not route.first.events:
-        apart = xp.abs(passage.pieces_q - found.q[..., None, :]) / sizes
+        difference = passage.pieces_q - found.q[..., None, :]
+        apart = xp.abs(difference) / sizes
         return isolated & (apart.max(axis=(-2, -1)) > _APART)
     return isolated
 
@@ -548,6 +566,8 @@ def agrees(route: Route, q, check: Check) -> Bool[Array, "*L"]:
     the period of the clock."""
     xp = namespace(q)
     other = check.passage
-    apart = xp.max(xp.abs(other.q - q) / route.map.sizes, axis=-1)
+    difference = xp.abs(other.q - q)
+    apart = xp.max(difference / route.map.sizes, axis=-1)
     same = xp.isfinite(apart) & (apart <= _APART)
-    return same & check.periodic & (other.error <= _ROUGH) & ~other.left
+    is_rough = other.error <= _ROUGH
+    return same & check.periodic & is_rough & ~other.left

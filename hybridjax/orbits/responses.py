@@ -112,7 +112,8 @@ class Coupling(Showable, eqx.Module):
         n = np.arange(len(self.coefficients))
         angle = 2j * np.pi * xp.asarray(lead)[..., None]
         waves = xp.exp(angle * n)
-        return xp.real(waves @ (self.coefficients * np.where(n == 0, 1, 2)))
+        twice = np.where(n == 0, 1, 2)
+        return xp.real(waves @ (self.coefficients * twice))
 
     __repr__ = fields
 
@@ -135,7 +136,8 @@ class Coupling(Showable, eqx.Module):
     @property
     def _slope(self) -> "Coupling":
         c = to_host(self.coefficients)
-        return Coupling(2j * np.pi * np.arange(len(c)) * c)
+        rates = 2j * np.pi * np.arange(len(c))
+        return Coupling(rates * c)
 
     def _zeros(self) -> tuple[Locked, ...]:
         """Zeros in one cycle, with the slopes there."""
@@ -148,7 +150,8 @@ class Coupling(Showable, eqx.Module):
         def value(x):
             return float(self([x])[0])
 
-        crossed = np.flatnonzero(sign[:-1] * sign[1:] < 0)
+        products = sign[:-1] * sign[1:]
+        crossed = np.flatnonzero(products < 0)
         roots = [
             optimize.brentq(value, *grid[k : k + 2], full_output=True)[0]
             for k in crossed
@@ -235,7 +238,8 @@ class Responses(Showable, eqx.Module):
         xp = namespace(self.period)
         jumps = self.flow.jumps
         s = self.structure
-        after = xp.roll(self._covector(mode)[:, 0], -1, axis=0)
+        last_covector = self._covector(mode)[:, 0]
+        after = xp.roll(last_covector, -1, axis=0)
         weight = xp.einsum("pi,piu->pu", after, jumps.by_input)
         place = xp.argsort(self.flow.event < 0, stable=True)
         phases = (self.flow.turn + self.flow.length) / self.period
@@ -262,7 +266,8 @@ class Responses(Showable, eqx.Module):
         period = float(self.period)
         phase = (flow.t - flow.t[0, 0]) / period
         # (A piece that ends in an event is separated from the next one.)
-        end = np.where(flow.event >= 0, np.nan, pushed[:, -1])
+        at_end = pushed[:, -1]
+        end = np.where(flow.event >= 0, np.nan, at_end)
         tail = end / period
         pairs = (phase, phase[:, -1]), (pushed / period, tail)
         phase, values = (
@@ -295,7 +300,8 @@ class Responses(Showable, eqx.Module):
         x, weight = np.polynomial.legendre.leggauss(NODES)
         begin_of_part = np.arange(parts)[:, None]
         x = ((begin_of_part + (x + 1) / 2) / parts).ravel()
-        times = flow.turn[:, None] + flow.length[:, None] * x
+        since = flow.length[:, None] * x
+        times = flow.turn[:, None] + since
         phase = (times / period).ravel()
         weight = (
             flow.length[:, None] / period * np.tile(weight / 2 / parts, parts)
@@ -307,7 +313,8 @@ class Responses(Showable, eqx.Module):
         else:
             wave = xp.asarray(push(phase), float)
         n = np.arange(harmonics + 1)
-        waves = xp.exp(-2j * np.pi * n[:, None] * phase)
+        turns = -2j * np.pi * n[:, None]
+        waves = xp.exp(turns * phase)
         weight = waves * weight
         wave = weight @ wave
         response = weight @ Z
@@ -315,10 +322,13 @@ class Responses(Showable, eqx.Module):
             wave_there = xp.exp(-2j * np.pi * n * x.phase)
             response += wave_there * x.weight[signal] / period
         c = xp.conj(response) * wave / period
-        if on_host(c) and np.abs(c[len(c) * 3 // 4 :]).max() > 1e-3 * np.abs(c).max():
-            raise DefinitionError(
-                f"`harmonics` = {harmonics} does not resolve jumps of the push."
-            )
+        if on_host(c):
+            last_quarter = c[len(c) * 3 // 4 :]
+            left_out = np.abs(last_quarter).max()
+            if left_out > 1e-3 * np.abs(c).max():
+                raise DefinitionError(
+                    f"`harmonics` = {harmonics} does not resolve jumps of the push."
+                )
         return Coupling(c)
 
     def __repr__(self):
@@ -347,7 +357,8 @@ class Responses(Showable, eqx.Module):
             name if name is None else [name]
         )
         by_input = self.flow.by_input[..., columns[0]]
-        return name, namespace(by_input).sum(self._covector(None) * by_input, axis=-1)
+        products = self._covector(None) * by_input
+        return name, namespace(by_input).sum(products, axis=-1)
 
     def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
         if mode is None:
@@ -370,7 +381,8 @@ class Responses(Showable, eqx.Module):
         pushed = xp.einsum("pki,pkiu->pku", covector, flow.by_input)
         covector = xp.einsum("pki,pkij->pkj", covector, self.surface)
         chart, states, inputs = flow.at(phase, self.period, covector, pushed)
-        named = by_name(s, chart, states) | dict(zip(s.inputs, inputs.T, strict=True))
+        of_inputs = dict(zip(s.inputs, inputs.T, strict=True))
+        named = by_name(s, chart, states) | of_inputs
         return {name: value * scale for name, value in named.items()}
 
 
@@ -397,9 +409,11 @@ def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
     exponents = xp.log(values + 0j) / period
     phase = None if clocked else flow.covectors(Z[:, None])[..., 0]
     # Amplitudes grow by their exponents; rounding adds responses of the phase.
-    to_go = period - (flow.t - flow.t[0, 0])[..., None]
+    since = flow.t - flow.t[0, 0]
+    to_go = period - since[..., None]
     amplitudes = xp.moveaxis(flow.covectors(left.T), -1, 0)
-    amplitudes = amplitudes * xp.exp(-exponents[:, None, None, None] * to_go)
+    rates = exponents[:, None, None, None]
+    amplitudes = amplitudes * xp.exp(-rates * to_go)
     if phase is not None:
         slip = xp.einsum("rpki,pki->rpk", amplitudes, flow.field)
         amplitudes = amplitudes - slip[..., None] * phase
@@ -442,16 +456,19 @@ def asymptotic_phase(
             f"`state` does not lie on the surface on which '{chart}' slides."
         )
     for _ in range(turns):
-        target = toward(np.full(1, np.inf), -1, lanes.t + 3 * period)
+        never = np.full(1, np.inf)
+        target = toward(never, -1, lanes.t + 3 * period)
         target = to_section(target, map.base, map.event)
         with at_ease():
-            moved = move(s, lanes, np.zeros((s.nu, 1)), target, map.settings).moved
+            no_input = np.zeros((s.nu, 1))
+            moved = move(s, lanes, no_input, target, map.settings).moved
         lanes = moved.lanes
         if moved.result[0] != Result.OK:
             break
         off = (lanes.q - map.anchor.q)[:, 0]
         if lanes.chart[0] == map.anchor.chart[0] and np.abs(off / size).max() < near:
-            return float((phase @ off - (lanes.t - begin.t)[0]) / period % 1.0)
+            late = (lanes.t - begin.t)[0]
+            return float((phase @ off - late) / period % 1.0)
     raise ComputationError(
         f"the state did not come to the cycle within {turns} crossings of its section (at t = "
         f"{lanes.t[0]:.6g}: {Result(int(moved.result[0])).message}): start nearer to a stable "
@@ -471,9 +488,11 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
         return monodromy - xp.eye(len(f)), xp.zeros_like(f)
     along = f / size**2
     along = along / (along @ f)
-    closed = monodromy - xp.eye(len(f)) + f[:, None] * along
+    back = f[:, None] * along
+    closed = monodromy - xp.eye(len(f)) + back
     if on_host(f):
-        smallest = svdvals(closed * size / size[:, None])[-1]
+        scaled = closed * size / size[:, None]
+        smallest = svdvals(scaled)[-1]
         if map.conserved or not smallest > SINGULAR:
             raise ComputationError(
                 "the cycle has no defined phase: its multiplier 1 is double, as in a family of "
@@ -527,7 +546,8 @@ def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
 
     *_, rows = xp.linalg.svd(still.T - value * np.eye(n))  # the last is contracted most
     right, root = pair(M, still, right)
-    left, _ = pair(M.T, still.T, xp.conj(rows[-1]))
+    last = xp.conj(rows[-1])
+    left, _ = pair(M.T, still.T, last)
     if on_host(M):
         lengths = np.linalg.norm(left) * np.linalg.norm(right)
         apart = np.abs(left @ right) / lengths
@@ -548,7 +568,8 @@ def surface(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"]:
     """The effect of pushes in charts of sliding; identity in others."""
     if not any(isinstance(chart, SlidingChart) for chart in s.charts):
         return namespace(flow.q).broadcast_to(np.eye(s.d), flow.by_state.shape)
-    effect = flow.evaluated(s, ft.partial(kernels.linear, s, _returned), s.d**2)
+    returned = ft.partial(kernels.linear, s, _returned)
+    effect = flow.evaluated(s, returned, s.d**2)
     return effect[..., 0].reshape(flow.by_state.shape)
 
 

@@ -211,7 +211,8 @@ class ReturnMap(eqx.Module):
         expected = self.multiplicity * (
             to_host(period) if on_host(self.expected) else period
         )
-        anchor = self.anchor._replace(t=self.anchor.t * (expected / self.expected))
+        ratio = expected / self.expected
+        anchor = self.anchor._replace(t=self.anchor.t * ratio)
         return dataclasses.replace(
             self, system=system, anchor=anchor, expected=expected
         )
@@ -227,8 +228,10 @@ class ReturnMap(eqx.Module):
 
     def slopes(self, lanes: Lanes) -> Float[Array, "d L"]:
         """The vector field at lanes, without input."""
-        u = namespace(lanes.t).zeros((self.structure.nu, lanes.t.shape[0]))
-        return slopes(self._structure_of(lanes), lanes.t, lanes.chart, lanes.q, u)
+        shape = (self.structure.nu, lanes.t.shape[0])
+        u = namespace(lanes.t).zeros(shape)
+        structure = self._structure_of(lanes)
+        return slopes(structure, lanes.t, lanes.chart, lanes.q, u)
 
     def _structure_of(self, lanes: Lanes) -> Structure:
         """The structure, for each piece of its turn if `lanes` are the pieces of all turns."""
@@ -243,10 +246,13 @@ class ReturnMap(eqx.Module):
         s = self.structure
         anchor = self.anchor
         xp = namespace(q)
-        lanes = start_lanes(s, anchor.t, anchor.chart, xp.atleast_2d(q).T)
+        states = xp.atleast_2d(q).T
+        lanes = start_lanes(s, anchor.t, anchor.chart, states)
         span = xp.atleast_1d(self.expected)
-        lanes = arm(s, lanes, self.watch(lanes, until(lanes.t)), span)
-        other = np.arange(len(s.transitions))[:, None] != self.event
+        watched = self.watch(lanes, until(lanes.t))
+        lanes = arm(s, lanes, watched, span)
+        index = np.arange(len(s.transitions))[:, None]
+        other = index != self.event
         return lanes._replace(armed=lanes.armed & other) if self.event >= 0 else lanes
 
     def turn(self, q: Float[Array, " d"], record: Recorded | None = None) -> Return:
@@ -286,7 +292,8 @@ class ReturnMap(eqx.Module):
         if linear.by_parameter is not None:
             returned = np.column_stack([returned, linear.by_parameter])
         returned = xp.where(self.valid[..., None], returned, 0.0)
-        jacobian = returned - np.eye(*held.shape[-2:]) - held
+        unit = np.eye(*held.shape[-2:])
+        jacobian = returned - unit - held
 
         lanes = side_by_side(linear.pieces)
         factors = linear.factors
@@ -295,8 +302,10 @@ class ReturnMap(eqx.Module):
             scale = self.scale[lanes.chart].reshape(PIECES, *q.shape)
             factors = across(f, scale, factors)
 
-        parts = (xp.abs(end.residual) + xp.abs(off)) / self.sizes
-        codes = self.each(xp.moveaxis(linear.tapes.code, -1, 0))
+        distance = xp.abs(end.residual) + xp.abs(off)
+        parts = distance / self.sizes
+        by_lane = xp.moveaxis(linear.tapes.code, -1, 0)
+        codes = self.each(by_lane)
 
         def pieces_last(x):
             return self.each(xp.moveaxis(x, (0, -1), (-1, 0)))
@@ -362,7 +371,8 @@ class ReturnMap(eqx.Module):
         if varied is None:
             s = self._structure_of(lanes)
             by, _ = tape_jacobian(s, lanes, ends, tape, True)
-            factors = by[:, 1:].reshape(PIECES, *q.shape, d)
+            by_state = by[:, 1:]
+            factors = by_state.reshape(PIECES, *q.shape, d)
         else:
             by, at = tape_jacobian(varied, lanes, ends, tape, False)
             by_parameter = self._by_parameter(varied, by[:, 1:], at)
@@ -388,11 +398,15 @@ class ReturnMap(eqx.Module):
         if self.base is None:
             longer = kernels.by_parameter_of_period(varied) * self.multiplicity
             later = longer / self.expected
-        column = later * t0 * by[0, :, 0] + by[0, :, -1]
+        by_begin = later * t0 * by[0, :, 0]
+        column = by_begin + by[0, :, -1]
         for piece in by[1:]:
-            column = piece[:, 1:-1] @ column + piece[:, -1]
-        end = self.anchor._replace(t=ends[:1, -1], q=ends[1:, -1:])
-        return column + later * (t0 + self.expected) * self.slopes(end)[:, 0]
+            carried = piece[:, 1:-1] @ column
+            column = carried + piece[:, -1]
+        last_state = ends[1:, -1:]
+        end = self.anchor._replace(t=ends[:1, -1], q=last_state)
+        moved = later * (t0 + self.expected)
+        return column + moved * self.slopes(end)[:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
         """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
@@ -401,30 +415,41 @@ class ReturnMap(eqx.Module):
         defect = self._defect(q, turn)
         existing = self.valid.sum(axis=-1)[..., None]
         counts = np.arange(self.structure.d) < existing
-        smallest = xp.min(xp.where(counts, svdvals(defect), np.inf), axis=-1)
+        singular_values = xp.where(counts, svdvals(defect), np.inf)
+        smallest = xp.min(singular_values, axis=-1)
         # (Where derivatives are large, rounding errors of the start are, too, at the end.)
-        grown = xp.max(xp.abs(defect), axis=(-2, -1))
+        modulus = xp.abs(defect)
+        grown = xp.max(modulus, axis=(-2, -1))
         assert self.settings.rtol is not None
         accuracy = xp.maximum(_ACCURACIES * self.settings.rtol, _ROUNDED * grown)
-        closed_enough = turn.closed & (turn.distance <= accuracy)
-        code = xp.where(turn.result == Result.OK, Result.NOT_CONVERGED, turn.result)
+        is_accurate = turn.distance <= accuracy
+        closed_enough = turn.closed & is_accurate
+        is_ok = turn.result == Result.OK
+        code = xp.where(is_ok, Result.NOT_CONVERGED, turn.result)
         closed = xp.where(smallest < SINGULAR, Result.SINGULAR, Result.OK)
-        code = xp.where(closed_enough & ~xp.isnan(smallest), closed, code)
+        is_known = ~xp.isnan(smallest)
+        code = xp.where(closed_enough & is_known, closed, code)
         if self.base is not None:
             if self.event >= 0:
-                ends_at_once = turn.closed & (self.followed(turn.end) >= 0)
+                is_followed = self.followed(turn.end) >= 0
+                ends_at_once = turn.closed & is_followed
                 code = xp.where(ends_at_once, Result.EVENT_ORDER, code)
             extra = turn.meetings > self.multiplicity
             code = xp.where(turn.closed & extra, Result.EXTRA_TURNS, code)
             at_rest = turn.closed & self._rests(q, turn)
             code = xp.where(at_rest, Result.EQUILIBRIUM, code)
-        code = xp.where(turn.closed & self._beyond(turn), Result.GUARD_BEYOND, code)
+        is_beyond = turn.closed & self._beyond(turn)
+        code = xp.where(is_beyond, Result.GUARD_BEYOND, code)
         for d in range(1, self.multiplicity):
             if self.multiplicity % d:
                 continue
+            # (A cycle that closes after a part of its turns is one of lower multiplicity.)
             sooner = self.expected * (d / self.multiplicity)
-            part = dataclasses.replace(self, multiplicity=d, expected=sooner).turn(q)
-            early = xp.max(xp.abs(part.residual) / sizes, axis=-1) <= CLOSED
+            shorter = dataclasses.replace(self, multiplicity=d, expected=sooner)
+            part = shorter.turn(q)
+            distance = xp.abs(part.residual) / sizes
+            misfit = xp.max(distance, axis=-1)
+            early = misfit <= CLOSED
             code = xp.where(turn.closed & early, Result.EXTRA_TURNS, code)
         return code.astype(np.int32)
 
@@ -432,18 +457,23 @@ class ReturnMap(eqx.Module):
         """The derivative of P(q) - q, in sizes of the states."""
         sizes = self.sizes
         unit = self.valid[..., None] * np.eye(self.structure.d)
-        returned = monodromy(namespace(q).moveaxis(turn.factors, -3, 0))
+        factors = namespace(q).moveaxis(turn.factors, -3, 0)
+        returned = monodromy(factors)
         defect = returned - unit - self.held(q)[1]
-        return defect * sizes[..., None, :] / sizes[..., None]
+        in_columns = defect * sizes[..., None, :]
+        return in_columns / sizes[..., None]
 
     def _rests(self, q: Float[Array, " d"], turn: Turn) -> Bool[Array, ""]:
         """Test whether a turn stays where it begins, as at an equilibrium."""
         xp = namespace(q)
-        same = turn.pieces.chart == self.each(self.anchor.chart)[..., None]
-        apart = xp.abs(turn.pieces.q - q[..., None])
+        chart = self.each(self.anchor.chart)[..., None]
+        same = turn.pieces.chart == chart
+        difference = turn.pieces.q - q[..., None]
+        apart = xp.abs(difference)
         apart = apart / self.sizes[..., None]
         farthest_state = xp.max(apart, axis=-2)
-        farthest = xp.max(xp.where(same, farthest_state, np.inf), axis=-1)
+        in_same_chart = xp.where(same, farthest_state, np.inf)
+        farthest = xp.max(in_same_chart, axis=-1)
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
     def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
@@ -455,33 +485,40 @@ class ReturnMap(eqx.Module):
             return namespace(turn.distance).zeros(shape, bool)
         xp = namespace(turn.distance)
         lanes = turn.pieces
-        if shape:  # (turns of many systems: their pieces side by side)
-            lanes = side_by_side(
-                jax.tree_util.tree_map(
-                    lambda x: xp.moveaxis(x, (-1, 0), (0, -1)), lanes
-                )
+        if shape:
+            # (The pieces of turns of many systems stand side by side.)
+            by_piece = jax.tree_util.tree_map(
+                lambda x: xp.moveaxis(x, (-1, 0), (0, -1)), lanes
             )
+            lanes = side_by_side(by_piece)
         watched = self.watch(lanes, until(lanes.t))
         value = watched.value[:-1]
         rate = watched.rate[:-1]
-        error = CLOSED * xp.max(self.expected) * xp.abs(rate)
+        longest = CLOSED * xp.max(self.expected)
+        error = longest * xp.abs(rate)
         here = belongs(s, lanes.chart)[:-1]
         u = xp.zeros((s.nu, len(lanes.t)))
         holds = []
         for g, transition in enumerate(s.transitions):
             source = lanes.chart == s.chart_index(transition.source)
             which = xp.where(source, np.int32(g), np.int32(-1))
-            holds.append(enabled(self._structure_of(lanes), lanes.t, lanes.q, u, which))
+            structure = self._structure_of(lanes)
+            holds.append(enabled(structure, lanes.t, lanes.q, u, which))
         codes = turn.codes.reshape(*shape, -1)
         fired = [xp.any(codes == g, axis=-1) for g in range(len(s.transitions))]
-        passed = here & ~lanes.armed & (value < -error)
-        fine = here & (lanes.armed | (value > error))
-        passed, fine = (
-            x.reshape(len(x), PIECES, *shape).any(axis=1)
-            for x in (passed & xp.stack(holds), fine)
-        )
+
+        def at_any_piece(x):
+            return x.reshape(len(x), PIECES, *shape).any(axis=1)
+
+        is_below = value < -error
+        is_above = value > error
+        passed = here & ~lanes.armed & is_below
+        fine = here & (lanes.armed | is_above)
+        passed = at_any_piece(passed & xp.stack(holds))
+        fine = at_any_piece(fine)
         # (An event that happens may leave the state beyond its guard.)
-        return (passed & ~fine & ~xp.stack(fired)).any(axis=0)
+        never_armed = passed & ~fine & ~xp.stack(fired)
+        return never_armed.any(axis=0)
 
     def followed(self, end: Lanes) -> Int[Array, ""]:
         """The transition (by index; -1: none) that follows at once on the event with which a turn
@@ -522,7 +559,8 @@ class ReturnMap(eqx.Module):
             / xp.swapaxes(steep, -1, -2)
         )
         back = stop_gradient(back)
-        return (back @ excess[..., None])[..., 0], back @ gradient
+        shift = (back @ excess[..., None])[..., 0]
+        return shift, back @ gradient
 
     def outputs(
         self,
@@ -582,8 +620,11 @@ class ReturnMap(eqx.Module):
             )
         else:
             rows = ends.time, ends.index, ends.event, ends.limit, record
-            (end, _, result), extra = scan(follow_piece, (lanes, h, lanes.events), rows)
-        same = each((result == Result.OK) & (end.chart == self.anchor.chart))
+            start = (lanes, h, lanes.events)
+            (end, _, result), extra = scan(follow_piece, start, rows)
+        is_ok = result == Result.OK
+        same_chart = end.chart == self.anchor.chart
+        same = each(is_ok & same_chart)
         returned = xp.where(self.valid, each(end.q.T), 0.0)
         off, _ = self.held(q)
         residual = returned - q - off
@@ -599,7 +640,8 @@ class ReturnMap(eqx.Module):
         """The starts and tapes of the pieces of one turn."""
         options = Options(True, new_input=False, tangents=True)
         with at_ease():
-            _, (lanes, _, tapes) = self.travel(self.anchor.q[:, 0], options)
+            state = self.anchor.q[:, 0]
+            _, (lanes, _, tapes) = self.travel(state, options)
         return lanes, tapes
 
     def ends(self) -> Target:
@@ -607,13 +649,17 @@ class ReturnMap(eqx.Module):
         t0 = self.each(self.anchor.t)
         expected = self.expected
         xp = namespace(self.expected)
-        k = xp.arange(1, PIECES + 1).reshape(PIECES, *[1] * expected.ndim)
+        ones = [1] * expected.ndim
+        numbers = xp.arange(1, PIECES + 1)
+        k = numbers.reshape(PIECES, *ones)
         if self.base is None:
-            return toward(t0 + expected * k / PIECES, -1, t0 + 2 * expected)
+            times = t0 + expected * k / PIECES
+            return toward(times, -1, t0 + 2 * expected)
         free = 1 - (1 - _FREE) / self.multiplicity
         grid = t0 + free * expected * k / (PIECES - 1)
         time = xp.where(k < PIECES, grid, np.inf)
-        section = to_section(toward(time, -1, t0 + 3 * expected), self.base, self.event)
+        target = toward(time, -1, t0 + 3 * expected)
+        section = to_section(target, self.base, self.event)
         last = k == PIECES
         return dataclasses.replace(
             section,
@@ -627,11 +673,17 @@ class ReturnMap(eqx.Module):
         if self.base is None:
             return xp.full(shape, self.multiplicity, np.int32)
         if self.event >= 0:
-            return xp.sum(codes == self.event, axis=(-2, -1), dtype=np.int32)
-        level = self.watch(pieces, to_section(until(pieces.t), self.base)).value[-1]
-        level, events = (x.reshape(PIECES, *shape) for x in (level, pieces.events))
-        crosses = (level[1:-1] > 0) & (level[2:] <= 0)
-        falls = crosses & (events[1:-1] == events[2:])
+            is_section = codes == self.event
+            return xp.sum(is_section, axis=(-2, -1), dtype=np.int32)
+        section = to_section(until(pieces.t), self.base)
+        level = self.watch(pieces, section).value[-1]
+        level = level.reshape(PIECES, *shape)
+        events = pieces.events.reshape(PIECES, *shape)
+        above = level[1:-1] > 0
+        at_or_below = level[2:] <= 0
+        crosses = above & at_or_below
+        without_event = events[1:-1] == events[2:]
+        falls = crosses & without_event
         return 1 + xp.sum(falls, axis=0, dtype=np.int32)
 
 
@@ -646,7 +698,8 @@ def across(
     that direction cannot drown a strong contraction across it.
     """
     project = projections(f, sizes)
-    return namespace(project).roll(project, -1, axis=0) @ factors @ project
+    next_project = namespace(project).roll(project, -1, axis=0)
+    return next_project @ factors @ project
 
 
 def with_derivatives(
@@ -669,13 +722,17 @@ def with_derivatives(
 
     def work(a, here, out):
         n = s.dims[a]
-        point = only(here, t), only(here, q[:n]), only(here, u)
+        time = only(here, t)
+        state = only(here, q[:n])
+        point = time, state, only(here, u)
         by = function(a, *point)
         inputs = slice(2 + s.d, 2 + s.d + s.nu)
-        index = np.ix_(np.arange(len(by)), np.r_[: 2 + n, inputs])
+        columns = np.r_[: 2 + n, inputs]
+        index = np.ix_(np.arange(len(by)), columns)
         return put(out, index, xp.where(here, by, out[index]))
 
-    begin = xp.zeros((rows, 2 + s.d + s.nu, L), t.dtype)
+    width = 2 + s.d + s.nu
+    begin = xp.zeros((rows, width, L), t.dtype)
     return for_each_chart(s, chart, xp.ones(L, bool), work, begin)
 
 

@@ -42,7 +42,8 @@ def events_on(map: ReturnMap, tape: Tape) -> Events:
         rivals=by_row(tape.rival),
     )
     if on_host(rows.codes):  # (most rows are moves without an event)
-        happens = (rows.codes.reshape(len(rows.codes), -1) >= 0).any(axis=1)
+        codes = rows.codes.reshape(len(rows.codes), -1)
+        happens = (codes >= 0).any(axis=1)
         rows = Events(*(x[happens] for x in rows))
     xp = namespace(rows.codes)
     last = xp.where(rows.codes >= 0, rows.times, xp.inf)
@@ -57,12 +58,11 @@ def _after_beginning(map: ReturnMap, events: Events, begin) -> Events:
         return events
     xp = namespace(events.times)
     first = map.event, begin, False, -1
-    return Events(
-        *(
-            xp.concatenate([xp.full_like(x[:1], value), x])
-            for x, value in zip(events, first, strict=True)
-        )
-    )
+    columns = []
+    for value, column in zip(first, events, strict=True):
+        head = xp.full_like(column[:1], value)
+        columns.append(xp.concatenate([head, column]))
+    return Events(*columns)
 
 
 def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]:
@@ -78,20 +78,24 @@ def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]
     happens = codes >= 0
     times = xp.where(happens, events.times, 0.0)
     is_schedule = np.append(s.clocks >= 0, False)  # (the last one is for no event)
-    by_clock = xp.asarray(is_schedule)[xp.maximum(codes, -1)]
+    event_or_none = xp.maximum(codes, -1)
+    by_clock = xp.asarray(is_schedule)[event_or_none]
 
     both_happen = happens[1:] & happens[:-1]
     both_by_clock = by_clock[1:] & by_clock[:-1]
     close = at_one_time(times[1:], times[:-1], period)
     close = close & both_happen & ~both_by_clock
-    follows = xp.concatenate([xp.zeros_like(happens[:1]), close])
+    first_follows_none = xp.zeros_like(happens[:1])
+    follows = xp.concatenate([first_follows_none, close])
     before = xp.concatenate([codes[:1], codes[:-1]])
-    out = xp.where(follows, before, xp.maximum(events.rivals, -1))
+    recorded = xp.maximum(events.rivals, -1)
+    rivals = xp.where(follows, before, recorded)
 
     for g in np.flatnonzero(s.clocks >= 0).tolist():
         missed = ~by_clock & is_due(s, g, codes, times, period)
-        out = xp.where(missed & (out < 0), np.int32(g), out)
-    return xp.where(happens, out, -1)
+        has_none = rivals < 0
+        rivals = xp.where(missed & has_none, np.int32(g), rivals)
+    return xp.where(happens, rivals, -1)
 
 
 def is_due(s: Structure, g: int, codes, times, period) -> Bool[Array, "E *S"]:

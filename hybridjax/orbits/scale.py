@@ -187,7 +187,8 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
     for a, state in enumerate(states):
         q = state[: s.dims[a]]
         if is_implicit(s, a) and np.isfinite(q).all():
-            (modes,) = _modes(s, a, np.array([t]), q[:, None])
+            time = np.array([t])
+            (modes,) = _modes(s, a, time, q[:, None])
             rates = np.abs(modes)
             decays = rates > ROUNDING * rates.max()
             slowest = rates[decays].min(initial=np.inf)
@@ -247,7 +248,8 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     n, K = q.shape
     times, states = _shifted(t, q)
     u = np.zeros((s.nu, 1))
-    expanded = kernels.field(s, a, times.ravel(), states.reshape(n, -1), u)
+    in_columns = states.reshape(n, -1)
+    expanded = kernels.field(s, a, times.ravel(), in_columns, u)
     expanded = expanded.reshape(n, -1, K, times.shape[1])
     values = expanded[:, 0]
     # (The first point is not shifted.)

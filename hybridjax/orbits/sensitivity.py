@@ -89,7 +89,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     f0 = flow.field[0, 0]
     clocked = map.base is None
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
-    starts, late, total = (x[..., 0] for x in flow.driven(xp.ones((*flow.t.shape, 1))))
+    constant = xp.ones((*flow.t.shape, 1))
+    starts, late, total = (x[..., 0] for x in flow.driven(constant))
     both = map.valid[:, None] & map.valid
     whole = xp.where(both, total[:, 1:], 0.0)
     closed, Z = loop(map, whole, f0)
@@ -104,7 +105,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
             )
-    begin = xp.linalg.solve(closed, -(total[:, 0] + f0 * longer))
+    change_of_end = total[:, 0] + f0 * longer
+    begin = xp.linalg.solve(closed, -change_of_end)
     starts = starts[..., 0] + starts[..., 1:] @ begin
     late = late[:, 0] + late[:, 1:] @ begin
     change = xp.einsum("pkab,pb->pka", flow.forward[0], starts)
@@ -117,10 +119,12 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
             ahead = by_state @ begin + by_parameter
         change = change + ahead * flow.field
         late = late - ahead
-    change = change + flow.field * (flow.after(map) / period * longer)[..., None]
+    part = flow.after(map) / period * longer
+    change = change + flow.field * part[..., None]
     place = xp.argsort(flow.event < 0, stable=True)[: len(events)]
     times = late[place]
-    wrapped = xp.concatenate([times[1:], times[:1] + longer]) - times
+    next_times = xp.concatenate([times[1:], times[:1] + longer])
+    wrapped = next_times - times
     names = tuple(s.transitions[g].name for g in events)
     return Sensitivity(
         varied.parameter, longer, names, times, wrapped, s, flow, period, change
@@ -141,7 +145,8 @@ def section_delay(
     def level(a, t, q, u):
         return kernels.watched(of, a, levels, t, q, u, index)[-1:]
 
-    by = with_derivatives(of, level, chart, t, q, 1)[0, 2 : 3 + len(f), 0]
+    derivatives = with_derivatives(of, level, chart, t, q, 1)
+    by = derivatives[0, 2 : 3 + len(f), 0]
     by_state = by[:-1]
     rate = -(by_state @ f)
     return by_state / rate, by[-1] / rate

@@ -71,7 +71,8 @@ def fixed_point(
     before = np.inf
     while (moves.order == 0).sum() == PIECES:
         step, shift, h = _shift(map, moves, x, target)
-        in_sizes = shift[:, 1:] / map.scale[moves.chart]
+        states = shift[:, 1:]
+        in_sizes = states / map.scale[moves.chart]
         length = np.max(np.abs(in_sizes))
         if not length <= 0.5 * before:
             break
@@ -101,10 +102,12 @@ def _shift(
     late = map.anchor.t[0] - starts[0, 0]
     changes = _changes(by_point, gaps, late)
     step = _step_of(map, x, changes[-1, 1:])
-    shift = changes[:-1] @ np.append(step * map.sizes, 1.0)
+    moved = np.append(step * map.sizes, 1.0)
+    shift = changes[:-1] @ moved
 
     end_after = end + np.matvec(by_point, shift)
-    h = end_after[:, 0] - starts[:, 0] - shift[:, 0]
+    duration = end_after[:, 0] - starts[:, 0]
+    h = duration - shift[:, 0]
     return step, shift, h
 
 
@@ -132,7 +135,8 @@ def _step_of(
     sizes = map.sizes
     q = x * sizes
     off, held = map.held(q)
-    returned = np.where(map.valid, end[:, -1], 0.0)
+    last = end[:, -1]
+    returned = np.where(map.valid, last, 0.0)
     valid = map.valid[:, None]
     by_start = np.where(valid, end[:, :-1], 0.0)
     residual = returned - q - off
@@ -155,7 +159,8 @@ def _forwards(moves: Moves) -> Moves | None:
     h[back - 1] += h[back]
     code[back - 1] = code[back]
     kept = moves.h >= 0
-    moves = Moves(*(x[..., kept] for x in moves._replace(h=h, code=code)))
+    changed = moves._replace(h=h, code=code)
+    moves = Moves(*(x[..., kept] for x in changed))
     return moves if (moves.h >= 0).all() else None
 
 
@@ -168,11 +173,13 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
     pieces, moved, tape, gap = followed
     if gap > CLOSED:
         return None
-    end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
+    last = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
+    end = last
     returned = np.where(map.valid, end.q[:, 0], 0.0)
     off, _ = map.held(q)
     residual = returned - q - off
-    residual = np.where(end.chart == map.anchor.chart, residual, np.nan)
+    same_chart = end.chart == map.anchor.chart
+    residual = np.where(same_chart, residual, np.nan)
     turn = Return(
         residual=residual,
         period=end.t[0] - map.anchor.t[0],
@@ -221,7 +228,8 @@ def follow_moves(
 def _starts(map: ReturnMap, begin: Lanes, moves: Moves) -> Lanes:
     """Lanes where moves start; the first one is that with which the turn begins."""
     s = map.structure
-    lanes = start_lanes(s, moves.t, moves.chart.astype(np.int32), moves.q)
+    charts = moves.chart.astype(np.int32)
+    lanes = start_lanes(s, moves.t, charts, moves.q)
     watched = map.watch(lanes, until(lanes.t))
     lanes = arm(s, lanes, watched, map.expected)
     lanes.armed[:, :1] = begin.armed
@@ -266,13 +274,17 @@ def _searched(
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
         end = moved.lanes
-        same = end.armed[:, :-1] == lanes.armed[:, 1:]
+        before = end.armed[:, :-1]
+        after = lanes.armed[:, 1:]
+        same = before == after
         armed = same[here].all()
         if armed:
             break
         lanes.armed[:, 1:] = end.armed[:, :-1]
-    in_chart = (end.chart[:-1] == lanes.chart[1:]).all()
-    in_order = (end.events[:-1] == lanes.events[1:]).all()
+    same_chart = end.chart[:-1] == lanes.chart[1:]
+    in_chart = same_chart.all()
+    same_events = end.events[:-1] == lanes.events[1:]
+    in_order = same_events.all()
     ok = (moved.result == Result.OK).all()
     if not (armed and in_chart and in_order and ok):
         return None
@@ -286,7 +298,8 @@ def _setout(
     """The first steps of moves."""
     # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
     to_time = np.where(moves.h > 0, 2 * moves.h, map.expected)
-    h = np.where(np.isfinite(target.time), to_time, 1.01 * moves.h)
+    is_to_time = np.isfinite(target.time)
+    h = np.where(is_to_time, to_time, 1.01 * moves.h)
     setout = stride(h)._replace(lead=0 * h)
     s = map.structure
     if not has_implicit(s):
@@ -295,9 +308,12 @@ def _setout(
     along = deviation(s, lanes, map.settings)
     _, by = linear_moves(s, moves, ends)
     by_state = by[:, 1:, 1 : 1 + s.d]
-    goes_on = (np.diff(moves.lane) == 0) & (moves.code[:-1] < 0)
+    same_lane = np.diff(moves.lane) == 0
+    no_event = moves.code[:-1] < 0
+    goes_on = same_lane & no_event
     for k in np.flatnonzero(goes_on):
-        along[:, k + 1] = by_state[k] @ along[:, k]
+        carried = by_state[k] @ along[:, k]
+        along[:, k + 1] = carried
     return setout._replace(along=along)
 
 
@@ -306,7 +322,8 @@ def _largest_gap(map: ReturnMap, begin: Lanes, lanes: Lanes, end: Lanes) -> floa
     states and in periods."""
     times = np.append(begin.t, end.t[:-1])
     states = np.column_stack([begin.q, end.q[:, :-1]])
-    sizes = np.maximum(map.scale[lanes.chart], np.abs(lanes.q.T))
+    magnitude = np.abs(lanes.q.T)
+    sizes = np.maximum(map.scale[lanes.chart], magnitude)
     late = (times - lanes.t) / map.expected
     apart = (states - lanes.q).T / sizes
     return max(np.abs(late).max(), np.abs(apart).max())

@@ -224,7 +224,8 @@ def _walk_along(cycle) -> _Path:
     event = np.maximum(moves.code, -1)
     # (A short move is known to more digits than the times of its ends.)
     between = np.diff(t)
-    same = np.abs(moves.h - between) <= 1e-14 * np.abs(t[1:])
+    rounding = 1e-14 * np.abs(t[1:])
+    same = np.abs(moves.h - between) <= rounding
     length = np.where(same, moves.h, between)
     walked = walk(
         s,
@@ -243,7 +244,8 @@ def _walk_along(cycle) -> _Path:
     delay = np.zeros(s.d)
     for k in np.flatnonzero(event >= 0):
         at_once = bool(moves.at_once[k])
-        at = float(t[k + 1]), int(chart[k]), q[:, k]
+        time = float(t[k + 1])
+        at = time, int(chart[k]), q[:, k]
         span = float(cycle.period)
         jumped = _jump(s, int(event[k]), *at, scale, span, at_once)
         # (The event before one at once has brought this about, and has delayed it.)
@@ -279,7 +281,8 @@ def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
 
 def _exists(s: Structure, chart: Int[np.ndarray, " P"]) -> Bool[np.ndarray, "d P"]:
     """Which of the padded states of points exist in their charts."""
-    return np.arange(s.d)[:, None] < np.array(s.dims)[chart]
+    dims = np.array(s.dims)[chart]
+    return np.arange(s.d)[:, None] < dims
 
 
 class _Jump(NamedTuple):
@@ -305,7 +308,9 @@ def _jump(
     transition = s.transitions[g]
     n = s.dims[a]
     u = np.zeros((s.nu, 1))
-    event = jump(s, g, np.array([t]), q[None, :n], u)
+    time = np.array([t])
+    state = q[None, :n]
+    event = jump(s, g, time, state, u)
     delay = np.zeros(s.d)
     if isinstance(transition.guard, Scheduled):
         findings = [] if at_once else _off_schedule(transition, t)
@@ -370,7 +375,8 @@ def _without_guard(transition, t: float, level: float, rate: float) -> Finding:
 
 def _off_schedule(transition, t: float) -> list[Finding]:
     """A finding on a scheduled event at another time."""
-    late = t - float(transition.guard.nearest(np.array([t]))[0])
+    nearest = transition.guard.nearest(np.array([t]))
+    late = t - float(nearest[0])
     if abs(late) <= 10 * SAME_TIME * float(transition.guard.period):
         return []
     text = (
@@ -393,7 +399,8 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
             later = period if k >= 0 else 0.0
             own_times = np.append(path.t[k % M], path.walked.t[own])
             times.append(later + own_times)
-            points = path.begin[:, k % M], path.walked.points[:, own]
+            begins = path.begin[:, k % M]
+            points = begins, path.walked.points[:, own]
             states.append(np.column_stack(points))
         a = int(path.chart[moves[0]])
         q = np.concatenate(states, axis=1)[: s.dims[a]]
@@ -415,7 +422,8 @@ def _moves_of_visits(event: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " m"]
     ends = np.flatnonzero(event >= 0)
     if not len(ends):
         return [np.arange(len(event))]
-    before = np.append(ends[-1] - len(event), ends[:-1])
+    last = ends[-1] - len(event)
+    before = np.append(last, ends[:-1])
     return [np.arange(a + 1, b + 1) for a, b in zip(before, ends, strict=True)]
 
 
@@ -480,7 +488,8 @@ def _at_zero(visit: Visit, level: Float[np.ndarray, " P"], point: int) -> Visit:
     chord from the point where it was positive."""
     before = int(np.flatnonzero(level[:point])[-1])
     part = level[before] / (level[before] - level[point])
-    t = visit.t[before] + part * (visit.t[point] - visit.t[before])
+    step = visit.t[point] - visit.t[before]
+    t = visit.t[before] + part * step
     begin = visit.q[:, before]
     end = visit.q[:, point]
     q = begin + part * (end - begin)
@@ -631,7 +640,8 @@ def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
     )
     reached = walk(map.structure, stretch, scale).q
     size = scale[path.chart[0]]
-    distance = np.abs(reached - path.begin[:, :1]) / size[:, None]
+    apart = np.abs(reached - path.begin[:, :1])
+    distance = apart / size[:, None]
     closed = (np.max(distance, axis=0) <= _APART) & (chart == path.chart[0])
     return [part for part, closes in zip(parts, closed, strict=True) if closes]
 

@@ -96,7 +96,8 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
         for within, t, states in path:
             lane.append(lanes[within])
             time.append(t)
-            points.append(np.pad(states, [(0, d - n), (0, 0)]))
+            missing = [(0, d - n), (0, 0)]
+            points.append(np.pad(states, missing))
     all_lanes = np.concatenate(lane)
     times = np.concatenate(time)
     all_points = np.concatenate(points, axis=1)
@@ -125,11 +126,13 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
 
     def field(t, x):
         u = np.zeros((s.nu, 1))
-        rows = kernels.field(s, a, t, x[..., 0].T, u)
+        states = x[..., 0].T
+        rows = kernels.field(s, a, t, states, u)
         return np.moveaxis(rows, -1, 0)
 
     unit = np.tile(np.eye(n), (L, 1, 1))
-    x = np.concatenate([q.T[..., None], unit], axis=2)
+    first_column = q.T[..., None]
+    x = np.concatenate([first_column, unit], axis=2)
     past = np.zeros(L)
     h = length.copy()
     error = np.zeros(L)
@@ -154,7 +157,8 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
             if len(lanes):
                 left = length[lanes] - past[lanes]
                 onward = past[lanes] + h[lanes]
-                ended = np.where(h[lanes] >= left, length[lanes], onward)
+                is_last = h[lanes] >= left
+                ended = np.where(is_last, length[lanes], onward)
                 by_end = field(begin[lanes] + ended, end[good])
                 within = _between(
                     t[good], h[lanes], x[lanes], end[good], by_field[lanes], by_end
@@ -207,10 +211,12 @@ def _linear_euler(
     for count in _EULER_STEPS:
         h = (length / count)[:, None, None]
         by_state = by_field[..., 2 : 2 + n]
-        matrix = np.linalg.inv(np.eye(n) - h * by_state)
+        implicit_part = np.eye(n) - h * by_state
+        matrix = np.linalg.inv(implicit_part)
         now = x
         for k in range(1, count + 1):
-            rates = _rates(field(t + k * length / count, now), now)
+            time = t + k * length / count
+            rates = _rates(field(time, now), now)
             now = now + h * (matrix @ rates)
         table.append(now)
     return _extrapolate(table, np.array(_EULER_STEPS))
@@ -225,14 +231,16 @@ def _extrapolate(
     previous = column[-1]
     for order in range(1, len(table)):
         previous = column[-1]
-        weights = divisors[order:] / divisors[:-order] - 1
+        ratios = divisors[order:] / divisors[:-order]
+        weights = ratios - 1
         refined = []
         for k, weight in enumerate(weights):
             coarser, finer = column[k : k + 2]
             refined.append(finer + (finer - coarser) / weight)
         column = refined
     limit = column[-1]
-    return limit, limit[..., 0] - previous[..., 0]
+    change = limit[..., 0] - previous[..., 0]
+    return limit, change
 
 
 def _between(
@@ -247,13 +255,15 @@ def _between(
         f = by_field[..., 0]
         by_time = by_field[..., 1]
         by_state = by_field[..., 2 : 2 + n]
-        acceleration = by_time + (by_state @ f[..., None])[..., 0]
+        along = (by_state @ f[..., None])[..., 0]
+        acceleration = by_time + along
         return h * f, h**2 * acceleration
 
     rate0, bend0 = rate_and_bend(by_begin)
     rate1, bend1 = rate_and_bend(by_end)
     q0 = x0[..., 0]
-    rise = x1[..., 0] - q0 - rate0 - bend0 / 2
+    whole = x1[..., 0] - q0
+    rise = whole - rate0 - bend0 / 2
     slope = rate1 - rate0 - bend0
     bend = bend1 - bend0
     third = 10 * rise - 4 * slope + bend / 2
@@ -262,6 +272,7 @@ def _between(
     path = []
     for z in _FRACTIONS:
         lower = q0 + rate0 * z + bend0 / 2 * z**2
-        higher = third * z**3 + fourth * z**4 + fifth * z**5
+        fifth_power = fifth * z**5
+        higher = third * z**3 + fourth * z**4 + fifth_power
         path.append((t + z * length, lower + higher))
     return path

@@ -146,7 +146,8 @@ class PlantCycle(Showable):
         rows = np.full((S, steps, len(self.outputs) + 1), np.nan)
         failed_at = np.full(len(u), -1)
         for s, (values, cause) in enumerate(trials):
-            rows[s, : len(values)] = np.reshape(values, (-1, rows.shape[-1]))
+            of_run = np.reshape(values, (-1, rows.shape[-1]))
+            rows[s, : len(values)] = of_run
             if cause:
                 failed_at[s] = len(values)
         causes = tuple(cause for _, cause in trials)
@@ -192,7 +193,8 @@ class PlantCycle(Showable):
         rows = []
         for part in (0.5, 0.0):
             inputs = part * u[s]
-            values, cause = self.drive.run(self.seed + 1 + s, inputs.tolist())
+            seed = self.seed + 1 + s
+            values, cause = self.drive.run(seed, inputs.tolist())
             if cause:
                 return []
             rows.append(np.array(values)[:, :-1])

@@ -95,7 +95,8 @@ class PlantPhase:
             return sign * (z[c] - value)
         if self.axes:
             x, y = ((z[column] - center) / scale for column, center, scale in self.axes)
-            angle = self.sense * (math.atan2(y, x) - self.first) / (2 * math.pi)
+            since = math.atan2(y, x) - self.first
+            angle = self.sense * since / (2 * math.pi)
             self.turns = angle + round(self.turns - angle)
         else:
             self.turns = (t - self.first) / self.period
@@ -386,7 +387,8 @@ def resume(
 
 def _start(packed: bytes, begun: list[Any]) -> Any:
     # (One thread of BLAS, because the processes use all cores.)
-    path = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), *sys.path]))
+    paths = [os.environ.get("PYTHONPATH"), *sys.path]
+    path = os.pathsep.join(filter(None, paths))
     command = [
         sys.executable,
         "-c",

@@ -208,7 +208,8 @@ class ReturnMap:
         """Measure the ranges of the coordinates, in one cycle."""
         points = list[At]()
         self(self.x, points)
-        rows = np.array([x.state for x in points], float)[:, self.columns]
+        states = np.array([x.state for x in points], float)
+        rows = states[:, self.columns]
         size = np.ptp(rows, axis=0)
         largest = np.abs(rows).max(axis=0)
         rounding = _REST * largest.max(initial=0)
@@ -260,7 +261,8 @@ class ReturnMap:
             10 * self.noise, 0.01 * np.abs(advance)
         )
         # (A state that is still settling does not advance at one rate.)
-        grows = np.abs(advance) > np.maximum(10 * self.noise, 1e-6 * self.size)
+        noticeable = np.maximum(10 * self.noise, 1e-6 * self.size)
+        grows = np.abs(advance) > noticeable
         grows = grows & steady
         tolerance = 10 * self.noise + 1e-6 * self.size
         travels = np.zeros(len(self.x), bool)
@@ -268,12 +270,14 @@ class ReturnMap:
             move = np.zeros(len(self.x))
             move[k] = self.size[k]
             try:
-                change = np.abs(self(self.x + move) - first - move)
+                moved_return = self(self.x + move)
+                change = np.abs(moved_return - first - move)
             except ComputationError:  # (where the plant falls, something depends on it)
                 continue
             travels[k] = bool((change <= tolerance).all())
         turns = steady & (np.abs(advance) > self.size / 2)
-        self.shift = self.shift + np.where(travels | turns, advance, 0.0)
+        passed = np.where(travels | turns, advance, 0.0)
+        self.shift = self.shift + passed
         self.travelling = tuple(
             name for name, x in zip(self.names, travels, strict=True) if x
         )
@@ -303,16 +307,21 @@ class ReturnMap:
         2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
         spacing the events that move through the time steps of a simulator.
         """
-        rounding = np.finfo(float).eps * np.maximum(np.abs(self.x), self.size)
+        magnitude = np.maximum(np.abs(self.x), self.size)
+        rounding = np.finfo(float).eps * magnitude
+        rng = np.random.default_rng(0)
+        signs = rng.choice([-1, 1], (3, len(self.x)))
+        spacings = [1e-6, 1e-4, 1e-3]
         levels = []
-        signs = np.random.default_rng(0).choice([-1, 1], (3, len(self.x)))
-        for spacing, sign in zip([1e-6, 1e-4, 1e-3], signs, strict=True):
+        for spacing, sign in zip(spacings, signs, strict=True):
             along = spacing * self.size * sign
             line = [self(self.x + j * along) for j in range(-7, 8)]
             differences = np.diff(line, 4, axis=0)
-            level = np.sqrt((differences**2 / 70).mean(axis=0))
+            variance = (differences**2 / 70).mean(axis=0)
+            level = np.sqrt(variance)
             levels.append(np.maximum(level, rounding))
-        return levels[0], np.max(levels, axis=0)
+        narrowest = levels[0]
+        return narrowest, np.max(levels, axis=0)
 
     def slopes(self) -> Float[np.ndarray, "d d"]:
         """Return central differences of second order with the smallest steps."""
@@ -355,7 +364,8 @@ class ReturnMap:
         the residual. A state whose residual is noise stays as it is."""
         residual = self.residual()
         for _ in range(8):
-            if (np.abs(residual) <= 3 * self.noise / self.size).all():
+            allowed = 3 * self.noise / self.size
+            if (np.abs(residual) <= allowed).all():
                 break
             J = self.slopes() - np.eye(len(self.x))
             J = J * self.size / self.size[:, None]
@@ -364,7 +374,8 @@ class ReturnMap:
             before = self.x
             self.x = before - self.size * step
             moved = self.residual()
-            if not np.abs(moved).max() < np.abs(residual).max():
+            reached = np.abs(moved).max()
+            if not reached < np.abs(residual).max():
                 self.x = before
                 break
             residual = moved
@@ -373,7 +384,8 @@ class ReturnMap:
     def require_on_cycle(self, residual: Float[np.ndarray, " d"]) -> None:
         """**Raises:** `ComputationError` for a state that is not on a cycle."""
         noise = self.noise / self.size
-        beyond = np.abs(residual) / np.maximum(10 * noise, _RESIDUAL)
+        visible = np.maximum(10 * noise, _RESIDUAL)
+        beyond = np.abs(residual) / visible
         k = int(np.argmax(beyond))
         if beyond[k] <= 1:
             return
@@ -443,7 +455,8 @@ def _hides(resolved: "_Resolved") -> bool:
 def _is_curved(resolved: "_Resolved") -> bool:
     """Return whether narrow and wide steps give clearly different multipliers."""
     moduli = np.abs(resolved.multipliers)
-    return bool((np.abs(resolved.apart) > _CURVED * moduli.max(initial=0)).any())
+    allowed = _CURVED * moduli.max(initial=0)
+    return bool((np.abs(resolved.apart) > allowed).any())
 
 
 class _Jacobian(NamedTuple):
@@ -483,7 +496,8 @@ def _fitted(
     steps = np.tile(_STEPS, repeats)
     weights = steps**2
     coefficients = np.tensordot(_solution(steps, _POWERS), slopes, (1, 0))
-    residuals = slopes - np.tensordot(_powers(steps, _POWERS), coefficients, (1, 0))
+    fitted = np.tensordot(_powers(steps, _POWERS), coefficients, (1, 0))
+    residuals = slopes - fitted
     # (Of unit weight.)
     residuals = residuals * np.sqrt(weights)[:, None, None]
     constant = _solution(steps, 2)[0]
@@ -550,17 +564,22 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
         left = left / product.conj()
     rows = left.conj().T
     # (Of pair j and eigenvalue i, the share of column k.)
-    noise = np.stack([(rows @ error) * right.T for error in jacobian.errors])
+    by_column = [(rows @ error) * right.T for error in jacobian.errors]
+    noise = np.stack(by_column)
     variance = (np.abs(noise) ** 2).sum(axis=0)
     by_component = np.abs(rows) ** 2 @ jacobian.tolerance**2
     common = by_component @ np.abs(right) ** 2
-    scatter = np.sqrt(variance.sum(axis=1) + np.diagonal(common))
+    variances = variance.sum(axis=1) + np.diagonal(common)
+    scatter = np.sqrt(variances)
     apart = np.diagonal(rows @ jacobian.apart @ right)
     is_noise = np.abs(apart) <= 2 * jacobian.apart_noise * scatter
     apart = np.where(is_noise, 0.0, apart)
-    condition = np.linalg.norm(left, axis=0) * np.linalg.norm(right, axis=0)
+    of_left = np.linalg.norm(left, axis=0)
+    of_right = np.linalg.norm(right, axis=0)
+    condition = of_left * of_right
     rounding = _ROUNDING * np.linalg.norm(J) * condition
-    error = np.hypot(scatter + rounding, _BIAS * np.abs(apart))
+    bias = _BIAS * np.abs(apart)
+    error = np.hypot(scatter + rounding, bias)
     return _Eigenvalues(
         value=values,
         left=left,
@@ -592,9 +611,11 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
         # (Eigenvectors of eigenvalues that nearly coincide.)
         w = np.linalg.solve(w @ v, w)
     apart = found.apart[rows]
-    biases = _BIAS * np.diag(apart) * rng.standard_normal((_DRAWS, 1, 1))
+    random = rng.standard_normal((_DRAWS, 1, 1))
+    biases = _BIAS * np.diag(apart) * random
     multipliers = found.value[rows]
-    blocks = np.diag(multipliers) + w @ draws @ v + biases
+    scattered = w @ draws @ v
+    blocks = np.diag(multipliers) + scattered + biases
     drawn = [coefficients_of(np.linalg.eigvals(block)) for block in blocks]
     return _Resolved(
         multipliers=multipliers,
@@ -616,7 +637,8 @@ def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
         differs[i] = differs[i] and differs[twin]
     rows = np.flatnonzero(differs)
     chosen = found.value[rows]
-    return rows[np.lexsort((-chosen.imag, -np.abs(chosen)))]
+    order = np.lexsort((-chosen.imag, -np.abs(chosen)))
+    return rows[order]
 
 
 def _bound(

@@ -1,5 +1,7 @@
 """Figures of data: experiments, recordings, impulse responses, and the validation of a model."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
@@ -61,32 +63,33 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
     nu = len(data.inputs)
     names = data.inputs + data.outputs
     cycle = np.concatenate([data.cycle_inputs, data.cycle_outputs], axis=1)
-    values = np.concatenate([np.hstack([r.u, r.y]) for r in data.records])
+    by_record = [np.hstack([r.u, r.y]) for r in data.records]
+    values = np.concatenate(by_record)
     samples = [r.first_section + np.arange(len(r.u)) for r in data.records]
     at = np.concatenate(samples) % N
     thin = slice(None, None, max(1, len(at) // 20000))
     phase = np.arange(N) / N
-    with panels(ax, len(names), 3, width=PAGE, height=0.5 + 1.4 * len(names)) as axes:
+    height = 0.5 + 1.4 * len(names)
+    with panels(ax, len(names), 3, width=PAGE, height=height) as axes:
         for i, (name, x) in enumerate(zip(names, values.T, strict=True)):
             average, spread, last = axes[i]
             average.plot(phase, cycle[:, i], ".-", ms=3, color=CYCLE[0])
             average.set_ylabel(axis_of(name))
-            spread.plot(
-                at[thin] / N, x[thin], ",", color=COLORS["gray"], rasterized=True
-            )
+
+            dots: Any = {"color": COLORS["gray"], "rasterized": True}
+            spread.plot(at[thin] / N, x[thin], ",", **dots)
             std = np.array([np.nanstd(x[at == n]) for n in range(N)])
             for sign in (-2, 2):
                 spread.plot(phase, sign * std, color=CYCLE[0])
             spread.set_ylabel(axis_of(name, deviation=True))
+
             for panel in (average, spread):
                 _powers_of_ten(panel)
             if i < nu:
-                f, power = input_spectrum(data)
-                floor = 1e-12 * power[:, i].max()
-                last.semilogy(f, np.maximum(power[:, i], floor), color=CYCLE[1])
-                last.set(xlabel="f (1/period)", ylabel=with_unit("power", square(name)))
+                _draw_spectrum(last, data, i)
             else:
-                last.plot(x[at == np.argmax(std)], lw=0.5, color=CYCLE[1])
+                at_most_spread = x[at == np.argmax(std)]
+                last.plot(at_most_spread, lw=0.5, color=CYCLE[1])
                 last.set_xlabel("cycle")
                 last.sharey(spread)
                 last.tick_params(labelleft=False)
@@ -94,6 +97,16 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             panel.set_xlabel("phase (cycles)")
         letters(axes)
     return Plot(axes)
+
+
+def _draw_spectrum(ax: Axes, data: SectionData, i: int) -> None:
+    """Draw the power spectrum of input i, without the part below rounding."""
+    f, power = input_spectrum(data)
+    floor = 1e-12 * power[:, i].max()
+    shown = np.maximum(power[:, i], floor)
+    ax.semilogy(f, shown, color=CYCLE[1])
+    label = with_unit("power", square(data.inputs[i]))
+    ax.set(xlabel="f (1/period)", ylabel=label)
 
 
 def _powers_of_ten(ax: Axes) -> None:
@@ -122,7 +135,8 @@ def impulse_responses(
             label = with_unit(f"{name} / impulse\n", ratio(name, impulse))
             look.colored(plane, responses.lag, responses.phase, values, label)
             plane.set_ylabel("phase of the push")
-            for k, m in enumerate(dict.fromkeys([0, N // 4, N // 2, 3 * N // 4])):
+            quarters = [0, N // 4, N // 2, 3 * N // 4]
+            for k, m in enumerate(dict.fromkeys(quarters)):
                 band = 1.96 * responses.errors[m, :, i, pushing]
                 line = {"color": CYCLE[k % len(CYCLE)]}
                 arrow = {
@@ -252,7 +266,8 @@ def validation(
     N = validation.n_sections
     ny = len(validation.outputs)
     shown = slice(max(len(validation.measured) - cycles * N, 0), None)
-    time = (validation.first_section + np.arange(len(validation.measured)))[shown] / N
+    sections = validation.first_section + np.arange(len(validation.measured))
+    time = sections[shown] / N
     limit = float(special.ndtri(0.995))
     with panels(ax, ny, 3, width=PAGE, height=0.6 + 1.6 * ny) as axes:
         for i, name in enumerate(validation.outputs):

@@ -52,10 +52,12 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
     with panels(ax, 2, 1, width=COLUMN, height=3.2, sharex=True) as axes:
         above, below = axes[:, 0]
         f = np.unique(plan.frequencies)
-        H = np.abs(np.asarray(model.htf(f, 0).H)[0])
+        response = np.asarray(model.htf(f, 0).H)[0]
+        H = np.abs(response)
         for k, name in enumerate(model.outputs):
             for i, _ in enumerate(model.inputs):
-                size = H[:, k, i] / H[:, k, i].max()
+                modulus = H[:, k, i]
+                size = modulus / modulus.max()
                 above.plot(f, size, color=CYCLE[k % len(CYCLE)], label=name)
         above.set(yscale="log", ylabel="$|H_0|$ / largest")
         above.legend()
@@ -70,7 +72,8 @@ def spectrum(plan: OptimalDesign, model: Model, *, ax: AxesLike | None = None) -
             style = dict(marker="o", ms=2, lw=0, color=color, label=label)
             below.plot(f[used], amplitude[used], **style)
         label = with_unit("amplitude, rms\nover experiments", unit_of(model.inputs[0]))
-        top = np.sqrt(2 * max(plan.power.max(), plan.usual_power.max()))
+        largest = max(plan.power.max(), plan.usual_power.max())
+        top = np.sqrt(2 * largest)
         limits = dict(xlim=(0, f.max()), ylim=(1e-3 * top, 2 * top))
         below.set(yscale="log", xlabel=FREQUENCY, ylabel=label, **limits)
         below.legend()

@@ -164,7 +164,8 @@ class Explorer:
         if gain and s.nu:
             f = _FREQUENCIES[(_FREQUENCIES % 1 > 0.01) | cycle.clocked]
             htf = cycle.htf(f, outputs=self._plane[0], inputs=s.inputs[0])
-            self._gain.set_data(f, np.abs(htf[0][:, 0, 0]))
+            modulus = np.abs(htf[0][:, 0, 0])
+            self._gain.set_data(f, modulus)
         self._gain.set_alpha(1.0 if gain else 0.3)
         self._lost.set_text(self.message)
         self._shade(bool(self.message))
@@ -190,7 +191,8 @@ class Explorer:
         self.move({name: value})
 
     def __repr__(self) -> str:
-        lines = [f"Explorer({_written(self.values)})", self.message, repr(self.cycle)]
+        title = f"Explorer({_written(self.values)})"
+        lines = [title, self.message, repr(self.cycle)]
         return "\n".join(filter(None, lines))
 
     def show(self) -> None:
@@ -303,7 +305,8 @@ def explore(
     ranges = ranges or {}
     for name in dict.fromkeys((*parameters, *ranges)):
         value = float(parameter_of(cycle.system, name))
-        low, high = map(float, ranges.get(name, sorted((0.5 * value, 1.5 * value))))
+        usual = sorted((0.5 * value, 1.5 * value))
+        low, high = map(float, ranges.get(name, usual))
         if not low <= value <= high or low == high:
             raise DefinitionError(
                 f"`ranges` of '{name}' must enclose its value, {value:.6g}."

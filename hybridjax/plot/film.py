@@ -83,13 +83,15 @@ def frames(
 # White, that of bodies, and each of the palette in four shades, as at the borders of lines.
 _INKS = np.array([to_rgb(color) for color in COLORS.values()])
 _SHADES = (1 + np.arange(1, 5)[:, None, None] / 4 * (_INKS - 1)).reshape(-1, 3)
-_PALETTE = 255 * np.vstack([np.ones(3), to_rgb(BODY), _SHADES])
+_WHITE = np.ones(3)
+_PALETTE = 255 * np.vstack([_WHITE, to_rgb(BODY), _SHADES])
 
 
 def gif(images: Sequence[Image.Image], interval: float) -> bytes:
     """A GIF that repeats. Its times are whole hundredths of a second, which together last as long
     as the frames."""
-    ends = np.round(100 * interval * np.arange(len(images) + 1))
+    numbers = np.arange(len(images) + 1)
+    ends = np.round(100 * interval * numbers)
     file = io.BytesIO()
     durations = [10 * max(2, int(x)) for x in np.diff(ends)]
     options: Any = {"save_all": True, "loop": 0, "disposal": 1}

@@ -317,7 +317,8 @@ class _BodePanels(NamedTuple):
         if radius is not None:
             is_certain = radius < size
             # (Parts of a line, no single points.)
-            is_certain &= np.convolve(is_certain, np.ones(3))[1:-1] > 1
+            neighbors = np.convolve(is_certain, np.ones(3))[1:-1]
+            is_certain &= neighbors > 1
         phase = _phase(f, values, is_certain, reference)
         shown = f * self.scale.factor
         self.upper.plot(shown, self.scale.magnitude(size), **line)
@@ -513,13 +514,15 @@ def _values(
     values = np.asarray(htf[m])[order, i, j]
     radius = None
     if htf.variance is not None:
-        radius = np.asarray(htf.select(m).confidence_radius())[0, order, i, j]
+        radii = np.asarray(htf.select(m).confidence_radius())
+        radius = radii[0, order, i, j]
     return np.asarray(htf.frequencies)[order], values, radius
 
 
 def _frequency_limits(ax: Axes, f) -> None:
     spacing = f[1] - f[0] if len(f) > 1 else 1.0
-    ax.set_xlim(min(0.0, f[0]), f[-1] + spacing)
+    first = min(0.0, f[0])
+    ax.set_xlim(first, f[-1] + spacing)
 
 
 def _name(m: int) -> str:
@@ -556,7 +559,8 @@ def _phase(f, values, known, reference: tuple | None) -> np.ndarray:
     """Return the phase in degrees where it is known, NaN elsewhere; whole turns are chosen as in
     the reference, a pair of frequencies and phases."""
     phase = np.full(len(f), np.nan)
-    phase[known] = np.degrees(np.unwrap(np.angle(values[known])))
+    angles = np.unwrap(np.angle(values[known]))
+    phase[known] = np.degrees(angles)
     if reference is not None and known.any() and len(reference[0]):
         off = np.interp(f[known], *reference) - phase[known]
         turns = np.median(off) / 360

@@ -159,7 +159,8 @@ class Track(NamedTuple):
         path = self.trajectory
         rows = np.flatnonzero(path.event >= 0)
         names = [path.structure.transitions[g].name for g in path.event[rows]]
-        ago = np.mod(self.times[:, None] - path.t[rows], self.period)
+        since = self.times[:, None] - path.t[rows]
+        ago = np.mod(since, self.period)
         recent = (ago >= 0) & (ago < flash)
         return [list(itertools.compress(names, row)) for row in recent]
 
@@ -251,7 +252,8 @@ def _film(
         multipliers = getattr(motion, "multipliers", ())
         has_circle = len(multipliers) > 0
         if plane is not None:
-            panel = figure.add_subplot(grid[0, 1] if has_circle else grid[:, 1])
+            place = grid[0, 1] if has_circle else grid[:, 1]
+            panel = figure.add_subplot(place)
             _draw_orbit(panel, motion, plane, sections, beside)
             parts += _dots(panel, tracks, plane, events, sections)
         if has_circle:
@@ -407,7 +409,8 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
     at = track.wrapped(track.times)
     scenes = pictures.at(at)
     size = float(max((pictures.high - pictures.low).max(), 1e-9))
-    ax.update_datalim([pictures.low - 0.08 * size, pictures.high + 0.08 * size])
+    margin = 0.08 * size
+    ax.update_datalim([pictures.low - margin, pictures.high + margin])
     ax.autoscale_view()
     ax.set(
         xticks=[],
@@ -420,7 +423,8 @@ def _picture(ax: Axes, track: Track) -> list[Part]:
     (dots,) = ax.plot([], [], "ko", ms=2.5, zorder=5)
     points = []
     for scene in scenes:
-        points.append(np.array([_NOWHERE[:2], *scene.points.values()]).T)
+        places_of_scene = [_NOWHERE[:2], *scene.points.values()]
+        points.append(np.array(places_of_scene).T)
     parts: list[Part] = [(dots, dots.set_data, points)]
     is_simple = len(scenes[0].lines) <= 4
     colors = itertools.cycle(CYCLE[: 3 if is_simple else 1])
@@ -457,7 +461,8 @@ def to_borders(line: Float[np.ndarray, "k 2"], size: float) -> Float[np.ndarray,
     """A line with its ends beyond the borders of a picture of this size."""
     ways = line[[0, -1]] - line[[1, -2]]
     lengths = np.linalg.norm(ways, axis=1, keepdims=True)
-    begin, end = line[[0, -1]] + 5 * size * ways / lengths
+    beyond = 5 * size * ways / lengths
+    begin, end = line[[0, -1]] + beyond
     return np.vstack([begin, line[1:-1], end])
 
 
@@ -472,7 +477,8 @@ def _marks(
     spacing = stride / max(1, round(stride / (0.1 * size))) or 0.1 * size
     marks = []
     for line, begin in zip(lines, -pictures.camera(at)[:, 0], strict=True):
-        low, high = np.round(line[[0, -1], 0] / spacing)
+        ends = line[[0, -1], 0]
+        low, high = np.round(ends / spacing)
         x = begin % spacing + spacing * np.arange(low, high)
         marks.append(np.stack([x, np.interp(x, *line.T)]))
     return marks
@@ -531,7 +537,8 @@ def _dots(ax: Axes, tracks: list[Track], plane, events, sections) -> list[Part]:
         mark(rings, ms=13, mec=track.color, **ring)
     if sections is not None:
         cycle = tracks[0]
-        ago = np.mod(cycle.times[:, None] - sections.lanes.t, cycle.period)
+        since = cycle.times[:, None] - sections.lanes.t
+        ago = np.mod(since, cycle.period)
         passed = sections.observe(plane)[ago.argmin(axis=1)]
         mark(passed, ms=9, mec=COLORS["green"], **ring)
     return parts

@@ -92,16 +92,20 @@ def cycle(
         panel = axes[0, 0]
         if perturbed is not None:
             points = np.array(perturbed(x, y)[1:])
-            begin = points[:, np.isfinite(points).all(axis=0)][:, :1]
+            is_known = np.isfinite(points).all(axis=0)
+            begin = points[:, is_known][:, :1]
             panel.plot(*begin, "s", ms=3.5, color=COLORS["red"], zorder=5)
             for line in by_chart(perturbed, x, y).values():
                 panel.plot(*line, color=COLORS["red"], lw=0.7, zorder=1)
         look = {"lw": 1.8, "zorder": 3, "solid_capstyle": "butt"}
         for a, line in by_chart(orbit, x, y).items():
-            panel.plot(*line, color=CHARTS[a % len(CHARTS)], label=s.names[a], **look)
+            shade = CHARTS[a % len(CHARTS)]
+            panel.plot(*line, color=shade, label=s.names[a], **look)
         t, *curve = orbit(x, y)
         points = np.stack(curve, axis=1)
-        center = (np.nanmin(points, axis=0) + np.nanmax(points, axis=0)) / 2
+        lowest = np.nanmin(points, axis=0)
+        highest = np.nanmax(points, axis=0)
+        center = (lowest + highest) / 2
         _arrow(panel, orbit, t, points)
         panel.margins(0.1)
         _events(panel, s, orbit, (x, y), center)
@@ -130,10 +134,12 @@ def _arrow(
     points: Float[np.ndarray, "p 2"],
 ) -> None:
     """An arrow of the direction, in the middle of the longest time without events."""
-    ends = np.union1d(orbit.t[orbit.event >= 0], orbit.t[[0, -1]])
+    jumps = orbit.t[orbit.event >= 0]
+    ends = np.union1d(jumps, orbit.t[[0, -1]])
     durations = np.diff(ends)
     longest = np.argmax(durations)
-    k = int(np.searchsorted(t, ends[longest] + durations[longest] / 2))
+    middle = ends[longest] + durations[longest] / 2
+    k = int(np.searchsorted(t, middle))
     look = {"arrowstyle": "-|>", "mutation_scale": 16, "color": "black", "lw": 0}
     ax.annotate("", points[k + 1], points[k], arrowprops=look, zorder=6)
 
@@ -170,9 +176,12 @@ def by_chart(
 ) -> dict[int, Float[np.ndarray, "2 p"]]:
     """The curve in each chart that a trajectory visits, with NaN between its stays."""
     t, chart, _ = trajectory.dense()
-    is_jump = (np.diff(t) == 0) | (np.diff(chart) != 0)
+    same_time = np.diff(t) == 0
+    other_chart = np.diff(chart) != 0
+    is_jump = same_time | other_chart
     cuts = np.flatnonzero(is_jump) + 1
-    curve = np.insert(trajectory(x, y)[1:], cuts, np.nan, axis=1)
+    values = trajectory(x, y)[1:]
+    curve = np.insert(values, cuts, np.nan, axis=1)
     chart = np.insert(chart, cuts, chart[cuts])
     curves = {}
     for a in np.unique(chart).tolist():
@@ -188,8 +197,10 @@ def at_events(
     """Return the transitions (e,) of the events, and the points (e, n) before and after each."""
     rows = np.flatnonzero(path.event >= 0)
     s = path.structure
-    before = observed(s, names, path.t[rows], path.chart[rows - 1], path.before[rows]).T
-    after = observed(s, names, path.t[rows], path.chart[rows], path.after[rows]).T
+    chart_before = path.chart[rows - 1]
+    before = observed(s, names, path.t[rows], chart_before, path.before[rows]).T
+    chart_after = path.chart[rows]
+    after = observed(s, names, path.t[rows], chart_after, path.after[rows]).T
     return path.event[rows], before, after
 
 
@@ -199,7 +210,8 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         name = s.transitions[g].name
         if not np.all(np.isfinite([before, after])):
             continue
-        if np.any(np.abs(after - before) > 1e-9 * (1 + np.abs(before))):
+        rounding = 1e-9 * (1 + np.abs(before))
+        if np.any(np.abs(after - before) > rounding):
             reset = np.stack([before, after], axis=1)
             ax.plot(*reset, "--", color="black", lw=0.8, zorder=2)
             ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
@@ -266,9 +278,12 @@ def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> 
     bars = []
     step = max(1, round(placed.n_sections / 8))
     for i, (point, along) in enumerate(_meetings(s, placed, names, unit)):
-        bars += [point - _BAR * along, point + _BAR * along, (np.nan, np.nan)]
+        first = point - _BAR * along
+        last = point + _BAR * along
+        bars += [first, last, (np.nan, np.nan)]
         if i % step == 0:  # at the end of the bar that is outside of the loop
-            outwards = np.sign(along / unit @ ((point - center) / unit)) or 1.0
+            from_center = (point - center) / unit
+            outwards = np.sign(along / unit @ from_center) or 1.0
             x, y = point + 2 * _BAR * outwards * along
             ax.text(x, y, str(i), **_NUMBER)
     label = f"sections ({placed.n_sections})"
@@ -288,7 +303,8 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
     for a in np.unique(charts).tolist():
         mask = charts == a
         q = states[: s.dims[a], mask]
-        at = times[mask], q, np.zeros((s.nu, 1))
+        no_input = np.zeros((s.nu, 1))
+        at = times[mask], q, no_input
         flow = kernels.field(s, a, *at)[:, 0]
         values = kernels.outputs(s, a, items, *at)
         points[mask], by_time, *by_state = values.transpose(1, 2, 0)
@@ -301,7 +317,8 @@ def _meetings(s: Structure, placed: PlacedSections, names, unit) -> Iterator[tup
         if curve is not None:
             across = curve * unit
         along = np.array([-across[1], across[0]])
-        yield points[k], unit * along / (np.linalg.norm(along) or 1.0)
+        length = np.linalg.norm(along) or 1.0
+        yield points[k], unit * along / length
 
 
 def _normal_in_plane(normal: np.ndarray, states: Any, names: Any) -> np.ndarray | None:

@@ -61,7 +61,8 @@ def branch(
         shown = set()
         drawn = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
-            first = b[0].structure.charts[int(b[0].anchor.chart[0])].states[0]
+            chart = int(b[0].anchor.chart[0])
+            first = b[0].structure.charts[chart].states[0]
             name = first if output is None else output
             height = b.largest(name)
             for part, stable in _parts(b):

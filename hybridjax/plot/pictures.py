@@ -39,7 +39,8 @@ class Pictures:
 
         length = t[-1] - t[0]
         self.period = min(period, length)
-        self.stride = origin[-1] + velocity[-1] * (self.period - length)
+        moved = velocity[-1] * (self.period - length)
+        self.stride = origin[-1] + moved
         if np.isinf(period):
             self.stride += place[-1] - place[0]
         self._t = t
@@ -65,7 +66,8 @@ class Pictures:
         return part[:, None] * self.stride
 
     def _seen(self, t, origin, drawings: list[Drawing]) -> list[Drawing]:
-        ways = np.pad(origin - self.camera(t), ((0, 0), (0, 1)))  # (a radius stays)
+        shift = origin - self.camera(t)
+        ways = np.pad(shift, ((0, 0), (0, 1)))  # (a radius stays)
         return list(map(_moved, drawings, ways))
 
 
@@ -95,7 +97,8 @@ def drawn(
     for a in np.unique(chart).tolist():
         rows = np.flatnonzero(chart == a)
         program = s.kernel(_flat, by_lane, a, code, lanes=4)
-        values = program(t[rows], q[rows, : s.dims[a]].T)
+        states = q[rows, : s.dims[a]].T
+        values = program(t[rows], states)
         for row, numbers in zip(rows, values.T, strict=True):
             drawings[row] = _drawing(drawing_of(s, a), numbers)
     return drawings

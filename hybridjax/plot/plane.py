@@ -1,6 +1,6 @@
 """Floquet multipliers, poles and zeros in the complex plane."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -63,28 +63,19 @@ def multipliers(
     reference = "estimate" if isinstance(true, MultiplierFit) else "exact"
     if isinstance(estimates, RationalFit | MultiplierFit):
         estimates = {"fit": estimates}
-    borders = _borders({reference: true, **(estimates or {})})
+    elif estimates is None:
+        estimates = {}
+    borders = _borders({reference: true, **estimates})
     true = _values(true)
     if true.size == 0:
         raise DefinitionError("`true` holds no multiplier to draw.")
-    series = _series(estimates or {})
+    series = _series(estimates)
     cross: dict[str, Any] = {"marker": "+", "ms": 9, "mew": 1.2, "color": "black"}
-    markers = [_Markers(reference, true, cross)]
-    for k, (label, z) in enumerate(series.items()):
-        error = compare_multipliers(z, true).max_error
-        look = {
-            "marker": _MARKERS[k % len(_MARKERS)],
-            "color": CYCLE[k % len(CYCLE)],
-            "label": rf"{label}: $|\Delta\lambda|$ = {error:.1e}",
-        }
-        markers.append(_Markers(label, z, {"ms": 5, "mew": 1.0, "mfc": "none", **look}))
+    markers = [_Markers(reference, true, cross), *_markers_of(series, true)]
     with panels(ax, height=3.5 + 0.15 * len(series)) as axes:
         panel = axes[0, 0]
         _unit_circle(panel)
-        farthest = max(np.abs(x.values).max() for x in markers)
-        far = 1.1 * max(1.0, farthest)
-        panel.set(xlim=(-far, far), ylim=(-far, far), aspect="equal")
-        panel.locator_params(nbins=5)
+        _enclose(panel, markers)
         boxes = [panel]
         if zoom and (series or borders):
             boxes += _zoom(panel, true, series, borders)
@@ -119,6 +110,32 @@ class _Markers(NamedTuple):
                 ends = [int(x.argmin()), int(x.argmax())]
             edge: Any = {"lw": 0.7, "marker": "|", "ms": 5, "markevery": ends}
             ax.plot(x, y, color=look["color"], **edge)
+
+
+def _markers_of(
+    series: Mapping[str, np.ndarray], true: np.ndarray
+) -> Iterator[_Markers]:
+    """Open markers of the estimates, each with its largest distance from the true multipliers."""
+    for k, (label, z) in enumerate(series.items()):
+        error = compare_multipliers(z, true).max_error
+        look = {
+            "ms": 5,
+            "mew": 1.0,
+            "mfc": "none",
+            "marker": _MARKERS[k % len(_MARKERS)],
+            "color": CYCLE[k % len(CYCLE)],
+            "label": rf"{label}: $|\Delta\lambda|$ = {error:.1e}",
+        }
+        yield _Markers(label, z, look)
+
+
+def _enclose(panel: Axes, markers: Sequence[_Markers]) -> None:
+    """Set limits around the unit circle and all multipliers."""
+    farthest = max(np.abs(x.values).max() for x in markers)
+    far = 1.1 * max(1.0, farthest)
+    limits = (-far, far)
+    panel.set(xlim=limits, ylim=limits, aspect="equal")
+    panel.locator_params(nbins=5)
 
 
 @checked
@@ -227,7 +244,8 @@ def _zoom(
 ) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
-    order = np.lexsort((-np.imag(true), -np.abs(true)))
+    by_modulus = -np.abs(true)
+    order = np.lexsort((-np.imag(true), by_modulus))
     leading = complex(true[order[0]])
     reaches = [1e-12]
     for z in series.values():
@@ -238,7 +256,8 @@ def _zoom(
     reach = 1.35 * max(reaches)
     side = 0.36
     far = ax.get_xlim()[1]
-    points = (np.concatenate([true, *series.values()]) / far + 1 + 1j) / 2
+    values = np.concatenate([true, *series.values()])
+    points = (values / far + 1 + 1j) / 2
     places = np.array(
         [
             0.6 + 0.5j,
@@ -249,7 +268,8 @@ def _zoom(
         ]
     )
     apart = points - places[:, None]
-    room = np.maximum(np.abs(apart.real), np.abs(apart.imag)).min(axis=1)
+    larger = np.maximum(np.abs(apart.real), np.abs(apart.imag))
+    room = larger.min(axis=1)
     place = places[int(room.argmax())]
     if 2 * reach > side * far or room.max() < side / 2:
         return []

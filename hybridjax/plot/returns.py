@@ -103,7 +103,8 @@ def return_map(
             first = line.fixed + 0.9 * (high - line.fixed) if start is None else start
             path = line.cobweb(first, iterates, (low, high))
             panel.plot(*path, color=COLORS["orange"], lw=0.9, label=f"from {first:.4g}")
-        near = line.fixed + np.array([-0.3, 0.3]) * (high - low) / 2
+        sides = np.array([-0.3, 0.3])
+        near = line.fixed + sides * (high - low) / 2
         tangent = line.fixed + line.multiplier * (near - line.fixed)
         label = f"slope {line.multiplier:.4g}: multiplier"
         panel.plot(near, tangent, "--", color=COLORS["red"], lw=1.2, label=label)
@@ -195,7 +196,8 @@ class _Line(NamedTuple):
         **Raises:** `DefinitionError` for a range that does not hold the cycle.
         """
         if range is None:
-            return self.fixed - _REACH * self.scale, self.fixed + _REACH * self.scale
+            reach = _REACH * self.scale
+            return self.fixed - reach, self.fixed + reach
         low, high = range
         if not low < self.fixed < high:
             raise DefinitionError(
@@ -207,7 +209,8 @@ class _Line(NamedTuple):
     def states(self, values: Float[np.ndarray, " L"]) -> Float[np.ndarray, "n L"]:
         """Return the states on the line with these values of the coordinate."""
         cycle = np.asarray(self.returns.fixed_point)
-        return cycle[:, None] + np.outer(self.direction, values - self.fixed)
+        since = values - self.fixed
+        return cycle[:, None] + np.outer(self.direction, since)
 
     def next(self, states: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
         """Return the states after one period, NaN if the section is not reached."""
@@ -238,14 +241,16 @@ def _jacobian(
     cycle = np.asarray(returns.fixed_point)
     changes = np.diag(_STEP * scales)
     starts = cycle[:, None] + np.hstack([changes, -changes])
-    ahead, behind = np.hsplit(np.asarray(arrivals(returns, starts, _PATIENCE).q), 2)
+    ends = np.asarray(arrivals(returns, starts, _PATIENCE).q)
+    ahead, behind = np.hsplit(ends, 2)
     return (ahead - behind) / (2 * _STEP * scales)
 
 
 def _largest_real(cycle: LimitCycle) -> float:
     """**Raises:** `DefinitionError` for a cycle without a real multiplier."""
     multipliers = cycle.multipliers
-    is_real = np.abs(np.imag(multipliers)) <= _REAL * np.abs(multipliers)
+    modulus = np.abs(multipliers)
+    is_real = np.abs(np.imag(multipliers)) <= _REAL * modulus
     if not is_real.any():
         raise DefinitionError(
             "return_map: the cycle has no real multiplier. Deviations turn from period to period, "

@@ -55,7 +55,8 @@ def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recordi
     experiment = columns["experiment"]
     N = int(columns["section"].max()) + 1
     _, counts = np.unique(experiment, return_counts=True)
-    if (counts != counts[0]).any() or (np.diff(experiment) < 0).any():
+    falls = (np.diff(experiment) < 0).any()
+    if (counts != counts[0]).any() or falls:
         raise FileFormatError(
             f"'{path}' must have experiments of one length, in order."
         )

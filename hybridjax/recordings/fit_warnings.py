@@ -247,7 +247,8 @@ def _about_excitation(
 def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
     """Find pairs of outputs whose median correlation over the sections is nearly one."""
     N, ny = grid.y.shape[2:]
-    y = np.where(grid.sampled, grid.y, np.nan).reshape(-1, N, ny)
+    measured = np.where(grid.sampled, grid.y, np.nan)
+    y = measured.reshape(-1, N, ny)
     for i, j in combinations(range(ny), 2):
         pair = y[..., [i, j]]
         known = np.asarray(np.isfinite(pair).all(axis=2))
@@ -355,7 +356,8 @@ def about_phase_response(curve: Any) -> Iterator[Finding]:
             "intervals, so that the data determine the mean of the curve, but hardly its shape: "
             "add input that changes within a cycle, up to twice the frequency of the rhythm.",
         )
-    finest = max(1, round(1 / (np.pi * max(curve.jitter, 1e-6))))
+    jitter = max(curve.jitter, 1e-6)
+    finest = max(1, round(1 / (np.pi * jitter)))
     yield Finding(
         "resolution",
         f"the jitter of {100 * curve.jitter:.2g} % of a cycle hides what is finer than harmonic "

@@ -176,7 +176,8 @@ def split(data: HasRecords) -> Split:
     cycles = sum(len(r.u) for r in data.records) / n_sections
     share = min(1.0, _ENOUGH / cycles)
     ends = [round(len(r.u) * share) for r in data.records]
-    short = [k for k, n in enumerate(ends) if n / 4 < _SHORTEST_END * n_sections]
+    shortest = _SHORTEST_END * n_sections
+    short = [k for k, n in enumerate(ends) if n / 4 < shortest]
     held_out = short[3::4]
     # If all records are short, but too few to hold one out, all are cut.
     fitted = short if held_out or len(short) < len(ends) else []

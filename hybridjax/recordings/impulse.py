@@ -193,7 +193,8 @@ def impulse_responses(
     slope = pushed(_slopes(fit, whole(numerators)))
     by_coefficients = np.einsum("ranij,ab,rbnij->rnij", slope, fit.covariance, slope)
     root = pushed(fit.roots.transpose(2, 0, 1, 3, 4))
-    by_numerators = (root**2).sum(axis=4) * fit.noise[:, None] ** 2
+    square = (root**2).sum(axis=4)
+    by_numerators = square * fit.noise[:, None] ** 2
     errors = np.sqrt(by_numerators + by_coefficients)
     durations = _durations(data)
     return ImpulseResponses(
@@ -215,7 +216,8 @@ def _slopes(
     """Return the derivatives of a recursion's right-hand side with respect to c."""
     N, R = fit.numerators.shape[:2]
     longest = len(response)
-    slope = np.zeros((longest, len(fit.coefficients), *response.shape[1:]))
+    shape = (longest, len(fit.coefficients), *response.shape[1:])
+    slope = np.zeros(shape)
     slope[:R] = fit.slopes.transpose(2, 0, 1, 3, 4)
     for j in range(slope.shape[1]):
         delay = (j + 1) * N
@@ -255,4 +257,5 @@ def _by_push(
     area = ndimage.correlate1d(durations, push, mode="wrap")
     m = np.arange(N)[:, None]
     r = np.arange(len(h))
-    return h[r, (m + r) % N] / area[:, None, None, None]
+    area_of_push = area[:, None, None, None]
+    return h[r, (m + r) % N] / area_of_push

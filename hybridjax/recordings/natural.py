@@ -144,7 +144,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         paired = self.compare(true)
         order = [int(np.argmin(abs(self.multipliers - z))) for z in paired.estimated]
         low, high = self.interval(level)[order].T
-        return (low <= np.abs(paired.true)) & (np.abs(paired.true) <= high)
+        modulus = np.abs(paired.true)
+        return (low <= modulus) & (modulus <= high)
 
     def compare(self, other: Truth) -> MultiplierComparison:
         """Pair the multipliers with true ones, or with those of another fit. There is no test: see
@@ -183,15 +184,18 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         """
         blocks = self._blocks
         wider = np.sqrt(blocks / (blocks - 1))
-        reach = wider * stats.t.ppf((1 + level) / 2, blocks - 1)
+        quantile = stats.t.ppf((1 + level) / 2, blocks - 1)
+        reach = wider * quantile
         values = self.plain if plain else self.multipliers
         draws = self.plain_draws if plain else self.draws
         is_real = values.imag == 0
         center = np.where(is_real, values.real, np.abs(values))
         drawn = np.where(is_real, draws.real, _moduli(values, draws))
         half = reach * drawn.std(axis=0)
-        ends = np.abs(np.stack([center - half, center + half], axis=1))
-        low = np.where(half < np.abs(center), ends.min(axis=1), 0.0)
+        pair = np.stack([center - half, center + half], axis=1)
+        ends = np.abs(pair)
+        is_one_sided = half < np.abs(center)
+        low = np.where(is_one_sided, ends.min(axis=1), 0.0)
         return np.stack([low, ends.max(axis=1)], axis=1)
 
     def __repr__(self) -> str:
@@ -212,8 +216,10 @@ def _moduli(
     product: draws may be two real numbers, one larger and one smaller than the modulus."""
     moduli = np.abs(draws)
     for k in np.flatnonzero(values.imag > 0):
-        twin = int(np.argmin(np.abs(values - values[k].conj())))
-        common = np.sqrt(moduli[:, k] * moduli[:, twin])
+        distance = np.abs(values - values[k].conj())
+        twin = int(np.argmin(distance))
+        square = moduli[:, k] * moduli[:, twin]
+        common = np.sqrt(square)
         moduli[:, [k, twin]] = common[:, None]
     return moduli
 
@@ -226,7 +232,8 @@ def _beside(values: Complex[np.ndarray, " d"], draws: Draws) -> Draws:
         return draws
     ordered = np.empty_like(draws)
     for row, drawn in enumerate(draws):
-        _, columns = linear_sum_assignment(np.abs(values[:, None] - drawn))
+        distances = np.abs(values[:, None] - drawn)
+        _, columns = linear_sum_assignment(distances)
         ordered[row] = drawn[columns]
     return ordered
 
@@ -323,8 +330,11 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     moments = _moments(data, order)
     K = len(moments.records)
     _, counts = np.unique(moments.records, return_counts=True)
-    block = max(_SHORTEST_BLOCK, round(_BLOCK * K ** (1 / 3)))
-    if np.median(counts) < _SHORTEST_BLOCK * block and len(counts) >= _SHORTEST_BLOCK:
+    by_length = round(_BLOCK * K ** (1 / 3))
+    block = max(_SHORTEST_BLOCK, by_length)
+    are_short = np.median(counts) < _SHORTEST_BLOCK * block
+    if are_short and len(counts) >= _SHORTEST_BLOCK:
+        # (Many short records are drawn as wholes.)
         block = int(counts.max())
     rng = np.random.default_rng(seed)
     # The first weights are those of all cycles, the others draws.
@@ -333,12 +343,18 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     state, forward, square, cross, ahead = (
         np.tensordot(weights, products, (1, 1)) for products in moments[:5]
     )
+    # Two stages: states from instruments, then the next states from these.
     first_stage = np.linalg.pinv(square, hermitian=True) @ cross.mT
-    by_instruments = ahead @ first_stage @ np.linalg.pinv(cross @ first_stage)
+    second_stage = np.linalg.pinv(cross @ first_stage)
+    by_instruments = ahead @ first_stage @ second_stage
     # (With the noise of the states: without it, weak instruments give variances near zero.)
-    multipliers = _multipliers(_corrected(by_instruments, state / K, K / len(counts)))
-    plain = _multipliers(forward @ np.linalg.inv(state))
-    explained = cross[0] @ np.linalg.solve(square[0], cross[0].mT)
+    mean_length = K / len(counts)
+    maps = _corrected(by_instruments, state / K, mean_length)
+    multipliers = _multipliers(maps)
+    plain_maps = forward @ np.linalg.inv(state)
+    plain = _multipliers(plain_maps)
+    by_instrument = np.linalg.solve(square[0], cross[0].mT)
+    explained = cross[0] @ by_instrument
     whole = np.trace(state[0], axis1=1, axis2=2)
     shares = np.trace(explained, axis1=1, axis2=2) / whole
     return NaturalMultipliers(
@@ -376,13 +392,15 @@ def _moments(data: SectionData, order: int) -> _Moments:
     **Raises:** `DefinitionError` for too few cycles, or signals, for so many.
     """
     N = data.n_sections
-    size = np.nanstd(np.concatenate([x.y for x in data.records]), axis=0)
+    outputs = np.concatenate([x.y for x in data.records])
+    size = np.nanstd(outputs, axis=0)
     if order > _EACH * len(size):
         raise DefinitionError(
             f"`order` must be at most {_EACH * len(size)}, the size of a state."
         )
     rows = _rows(data)
-    names, cycle = np.unique(rows[:, :2], axis=0, return_inverse=True)
+    pairs = rows[:, :2]
+    names, cycle = np.unique(pairs, axis=0, return_inverse=True)
     K = len(names)
     needed = 2 * (_EACH * order + 2)
     if K < needed:
@@ -403,7 +421,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
     state = values(0, _EACH)
     after = values(-N, _EACH)
     instruments = values(2 * _EACH - 1, _EACH + 1)
-    known = np.isfinite(np.hstack([state, after, instruments])).all(axis=1)
+    columns = np.hstack([state, after, instruments])
+    known = np.isfinite(columns).all(axis=1)
     most = min(_EACH * (order + 1), instruments.shape[1])
     moments = _Moments(
         state=np.zeros((N, K, order, order)),
@@ -414,7 +433,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
         records=names[:, 0],
     )
     for n in range(N):
-        at = np.flatnonzero(known & (rows[:, 2] == n))
+        in_section = rows[:, 2] == n
+        at = np.flatnonzero(known & in_section)
         if len(at) <= most + 1:
             raise DefinitionError(
                 f"section {n} was seen in {len(at)} cycles only: record longer."
@@ -439,7 +459,8 @@ def _rows(data: SectionData) -> Int[np.ndarray, "rows 4"]:
     for s, record in enumerate(data.records):
         sample = np.arange(before, len(record.y) - N)
         cycle, section = np.divmod(record.first_section + sample, N)
-        rows.append(np.stack([np.full_like(sample, s), cycle, section, sample], axis=1))
+        numbers = np.full_like(sample, s)
+        rows.append(np.stack([numbers, cycle, section, sample], axis=1))
     return np.concatenate(rows)
 
 
@@ -458,30 +479,39 @@ def _principal(
     """Return both in the combinations along which the first varies most, with its variance 1."""
     mean = x.mean(axis=0)
     _, s, axes = np.linalg.svd(x - mean, full_matrices=False)
-    size = np.maximum(s[:count], 1e-9 * s[0])  # below: rounding
-    onto = axes[:count].T / size * np.sqrt(len(x))
-    return (x - mean) @ onto, (other - other.mean(axis=0)) @ onto
+    rounding = 1e-9 * s[0]
+    size = np.maximum(s[:count], rounding)  # below: rounding
+    scaled = axes[:count].T / size
+    onto = scaled * np.sqrt(len(x))
+    other_deviation = other - other.mean(axis=0)
+    return (x - mean) @ onto, other_deviation @ onto
 
 
 def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     """Return roots of the mean characteristic polynomial over the sections, the largest first."""
     values = np.linalg.eigvals(maps)
+    draws, sections, d = values.shape
     # The coefficients of (z - values[0]) (z - values[1]) ..., the highest power first.
-    polynomial = np.ones((*values.shape[:2], 1), complex)
-    for k in range(values.shape[2]):
-        times_z = np.pad(polynomial, ((0, 0), (0, 0), (0, 1)))
-        times_value = np.pad(polynomial, ((0, 0), (0, 0), (1, 0)))
-        polynomial = times_z - values[..., k, None] * times_value
+    polynomial = np.ones((draws, sections, 1), complex)
+    behind = ((0, 0), (0, 0), (0, 1))
+    ahead = ((0, 0), (0, 0), (1, 0))
+    for k in range(d):
+        times_z = np.pad(polynomial, behind)
+        shifted = np.pad(polynomial, ahead)
+        times_value = values[..., k, None] * shifted
+        polynomial = times_z - times_value
     mean = np.real(polynomial).mean(axis=1)
     # (Roots are eigenvalues of companion matrices, of all draws at once.)
-    companion = np.zeros((len(mean), *values.shape[2:], *values.shape[2:]))
+    companion = np.zeros((draws, d, d))
     companion[:, 0] = -mean[:, 1:]
-    companion[:, 1:, :-1] = np.eye(values.shape[2] - 1)
-    return _largest_first(np.linalg.eigvals(companion).astype(complex))
+    companion[:, 1:, :-1] = np.eye(d - 1)
+    roots = np.linalg.eigvals(companion)
+    return _largest_first(roots.astype(complex))
 
 
 def _largest_first(z: Draws) -> Draws:
-    return np.take_along_axis(z, np.argsort(-np.abs(z), axis=1, kind="stable"), axis=1)
+    order = np.argsort(-np.abs(z), axis=1, kind="stable")
+    return np.take_along_axis(z, order, axis=1)
 
 
 def _corrected(
@@ -498,31 +528,42 @@ def _corrected(
     over the length, with $G = \Sigma - J \Sigma J^T$ the covariance of the disturbances. For one
     multiplier this is Kendall's (1 + 3 z) / length.
     """
-    eye = np.eye(maps.shape[-1])
+    d = maps.shape[-1]
+    eye = np.eye(d)
     state = _positive(covariance)
-    disturbances = _positive(state - maps @ state @ maps.mT)
+    carried = maps @ state @ maps.mT
+    disturbances = _positive(state - carried)
     values = np.linalg.eigvals(maps)
     # (Of unstable draws, the bias at the edge of stability.)
     largest = np.abs(values).max(axis=-1)
     inside = np.minimum(1.0, _STABLE / np.maximum(largest, _STABLE))
     values = values * inside[..., None]
     back = maps.mT * inside[..., None, None]
-    sums = np.linalg.inv(eye - back) + back @ np.linalg.inv(eye - back @ back)
-    for k in range(values.shape[-1]):
+    # The three terms of the formula.
+    by_mean = np.linalg.inv(eye - back)
+    by_past = back @ np.linalg.inv(eye - back @ back)
+    sums = by_mean + by_past
+    for k in range(d):
         value = values[..., k, None, None]
-        sums = sums + (value * np.linalg.inv(eye - value * back)).real
+        by_value = value * np.linalg.inv(eye - value * back)
+        sums = sums + by_value.real
     change = disturbances @ sums @ np.linalg.inv(state) / length
     # (Of d equal multipliers it is 3 + d at most; maps far from normal would be moved without end.)
-    largest = (3 + maps.shape[-1]) / length
-    size = np.linalg.norm(change, 2, axis=(-2, -1))[..., None, None]
-    return maps + change * np.minimum(1.0, largest / np.maximum(size, largest))
+    largest_change = (3 + d) / length
+    norm = np.linalg.norm(change, 2, axis=(-2, -1))
+    size = norm[..., None, None]
+    kept = np.minimum(1.0, largest_change / np.maximum(size, largest_change))
+    return maps + change * kept
 
 
 def _positive(covariance: Float[np.ndarray, "B N d d"]) -> Float[np.ndarray, "B N d d"]:
     """Return the nearest covariances of full rank: estimates may have negative variances."""
-    values, axes = np.linalg.eigh((covariance + covariance.mT) / 2)
-    least = _LEAST_VARIANCE * np.abs(values[..., -1:])
-    return (axes * np.maximum(values, least)[..., None, :]) @ axes.mT
+    symmetric = (covariance + covariance.mT) / 2
+    values, axes = np.linalg.eigh(symmetric)
+    largest = np.abs(values[..., -1:])
+    least = _LEAST_VARIANCE * largest
+    positive_values = np.maximum(values, least)[..., None, :]
+    return (axes * positive_values) @ axes.mT
 
 
 def _resampled(
@@ -534,12 +575,15 @@ def _resampled(
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
         chosen = rng.choice(names, len(names))
-        return (records[:, None] == chosen).sum(axis=1).astype(float)
+        is_drawn = records[:, None] == chosen
+        return is_drawn.sum(axis=1).astype(float)
     weights = np.zeros(len(records))
     for record, count in zip(names, counts, strict=True):
         length = min(block, count)
-        starts = rng.integers(0, count - length + 1, -(-count // length))
-        drawn = (starts[:, None] + np.arange(length)).ravel()[:count]
+        number = -(-count // length)
+        starts = rng.integers(0, count - length + 1, number)
+        rows = starts[:, None] + np.arange(length)
+        drawn = rows.ravel()[:count]
         cycles = np.flatnonzero(records == record)
         np.add.at(weights, cycles[drawn], 1.0)
     return weights

@@ -164,10 +164,12 @@ def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
     total = 0
     stretches = []
     for time, angle in angles:
-        ends = np.flatnonzero(np.diff(time) > LONGEST_GAP / abs(rate)) + 1
+        longest = LONGEST_GAP / abs(rate)
+        ends = np.flatnonzero(np.diff(time) > longest) + 1
         of_trial = []
         for part in np.split(np.arange(len(time)), ends):
-            phase = np.sign(rate) * np.unwrap(angle[part]) / (2 * np.pi)
+            unwrapped = np.unwrap(angle[part])
+            phase = np.sign(rate) * unwrapped / (2 * np.pi)
             from_below = np.maximum.accumulate(phase)
             from_above = np.minimum.accumulate(phase[::-1])[::-1]
             mean = (from_below + from_above) / 2
@@ -217,7 +219,8 @@ def _angles(
     first = 0.0 if isinstance(anchor, Crossing) else float(anchor)
 
     def angle_of(x: Series, v: Series) -> Series:
-        return np.angle((x + 1j * v) * np.exp(-1j * first))
+        start = np.exp(-1j * first)
+        return np.angle((x + 1j * v) * start)
 
     rate = abs(_turns_per_time([(time, angle_of(*z.T)) for time, z in samples]))
     bandwidth = bandwidth or HARMONICS * rate
@@ -230,7 +233,8 @@ def _angles(
         at_anchor = _angle_at(recording, anchor, bandwidth, angles)
         relative = []
         for time, a in angles:
-            relative.append((time, np.angle(np.exp(1j * (a - at_anchor)))))
+            difference = np.exp(1j * (a - at_anchor))
+            relative.append((time, np.angle(difference)))
         angles = relative
     return angles
 
@@ -309,7 +313,8 @@ def _angle_at(
 def _turns_per_time(angles: Sequence[_Angle]) -> float:
     """Return the signed rate. **Raises:** `DefinitionError` if the angle does not wind twice."""
     unwrapped = [np.unwrap(a) for _, a in angles]
-    turns = sum(float(a[-1] - a[0]) for a in unwrapped) / (2 * np.pi)
+    advance = sum(float(a[-1] - a[0]) for a in unwrapped)
+    turns = advance / (2 * np.pi)
     span = sum(float(t[-1] - t[0]) for t, _ in angles)
     if abs(turns) < 2:
         raise DefinitionError(
@@ -386,7 +391,8 @@ def _rhythm(intervals: Series) -> _Rhythm:
     longer = length[middle:]
     shorter = length[middle::-1]
     longest = longer[np.argmax(np.diff(longer, append=np.inf) > 0.25)]
-    shortest = shorter[np.argmax(np.diff(shorter, append=-np.inf) < -0.1)]
+    falls = np.diff(shorter, append=-np.inf) < -0.1
+    shortest = shorter[np.argmax(falls)]
     missed = max(1.5, 1.01 * float(longest))
     doubled = min(0.5, 0.99 * float(shortest))
     if (length > missed).mean() > _COMMON:

@@ -271,7 +271,8 @@ class Recording(Showable, eqx.Module):
                     f"trial '{trial.name}': {signal} is never seen to cross {level:g}, "
                     f"{crossing.direction}: {remedy}."
                 )
-            crossed = find_root(_minus(curve, level), (t[at], t[at + 1])).x
+            interval = (t[at], t[at + 1])
+            crossed = find_root(_minus(curve, level), interval).x
             trials.append(replace(trial, events=trial.events | {event: crossed}))
         return self.with_trials(trials)
 
@@ -427,7 +428,8 @@ def _begins_again(time: Series, bad: int) -> bool:
     from there."""
     so_far = np.ptp(time[:bad])
     after = time[bad : bad + 3]
-    goes_on = len(after) > 1 and bool((np.diff(after) > 0).all())
+    rises = bool((np.diff(after) > 0).all())
+    goes_on = len(after) > 1 and rises
     jump_back = time[bad - 1] - time[bad]
     return jump_back > so_far / 2 and goes_on and bad > 2
 
@@ -456,7 +458,9 @@ def check_events(
     """
     at = at[np.isfinite(at)]
     margin = float(np.median(np.diff(time)))
-    within = (at >= time[0] - margin) & (at <= time[-1] + margin)
+    begun = at >= time[0] - margin
+    not_over = at <= time[-1] + margin
+    within = begun & not_over
     if len(at) and not within.any():
         raise DefinitionError(
             f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording "

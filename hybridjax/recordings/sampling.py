@@ -372,7 +372,8 @@ def _require_times(part: _Sections, N: int, step: float) -> None:
     waves = np.exp(1j * angle).view(float)
     unexplained = late - waves @ np.linalg.lstsq(waves, late)[0]
     # Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.
-    if unexplained.std() <= 0.1 * late.std() + ROUNDING * t[-1]:
+    allowed = 0.1 * late.std() + ROUNDING * t[-1]
+    if unexplained.std() <= allowed:
         raise DefinitionError(
             "the times of sections deviate only by rounding and interpolation between samples, "
             "as if the phase were the clock's own: use outputs, not times, or another phase."
@@ -398,7 +399,8 @@ def _sample(
         t = stretch.when(k / N)
         t = np.clip(t, stretch.time[0], stretch.time[-1])
         start = t[:-1]
-        long_gaps = np.diff(stretch.gaps, axis=1)[:, 0] > plan.period / N
+        lengths = np.diff(stretch.gaps, axis=1)[:, 0]
+        long_gaps = lengths > plan.period / N
         observed = ~inside(stretch.gaps[long_gaps], start, start)
         values = np.zeros((len(start), signals.shape[1]))
         change = np.zeros((len(start), len(of_output)))
@@ -406,7 +408,8 @@ def _sample(
             known = np.isfinite(x)
             values[:, i] = _held(time[known], x[known], t, plan)
         for i, output in enumerate(of_output):
-            values[:, nu + i] = np.where(observed, output.at(start), np.nan)
+            at_start = output.at(start)
+            values[:, nu + i] = np.where(observed, at_start, np.nan)
             change[:, i] = output.change(start)
         none = np.zeros((0, 0))
         sections.append(

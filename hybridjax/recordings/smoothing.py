@@ -90,7 +90,8 @@ def _smoothed(h: Float[np.ndarray, " n1"], values: Series, weight: float) -> Ser
     # (`Any`, since checkers of types infer one number from the default.)
     downwards: Any = [0, -1, -2]
     around: Any = [-1, 0, 1]
-    differences = [1 / before, -1 / before - 1 / after, 1 / after]
+    middle = -1 / before - 1 / after
+    differences = [1 / before, middle, 1 / after]
     Q = diags_array(differences, offsets=downwards, shape=shape)
     coupling = after[:-1] / 6
     R = diags_array([coupling, (before + after) / 3, coupling], offsets=around)
@@ -172,7 +173,8 @@ def spike_heights(values: Series) -> Series:
     smallest_step = steps[steps > 0].min(initial=np.inf)
     least = _NOISES * max(noise_of(x), smallest_step)
     spikes = np.flatnonzero(np.abs(height) > least)
-    spikes = spikes[np.abs(height[spikes]) > RANGES * _ranges_nearby(x, spikes)]
+    usual = RANGES * _ranges_nearby(x, spikes)
+    spikes = spikes[np.abs(height[spikes]) > usual]
     last_near = np.searchsorted(spikes, spikes + _NEAR + 1)
     first_near = np.searchsorted(spikes, spikes - _NEAR)
     spikes = spikes[last_near - first_near <= 2 * _LONGEST]
@@ -198,7 +200,8 @@ def _ranges_nearby(
     half = _NEIGHBORHOOD // 2
     first = np.clip(samples - half, 0, len(x) - _NEIGHBORHOOD)
     neighbors = np.sort(sliding_window_view(x, _NEIGHBORHOOD)[first], axis=1)
-    ranges = neighbors[:, half:] - neighbors[:, : half + 1]
+    later = neighbors[:, half:]
+    ranges = later - neighbors[:, : half + 1]
     return ranges.min(axis=1)
 
 

@@ -67,7 +67,8 @@ def monte_carlo(
     **Before:** `hj.run_experiments`, `hj.experiments.simulate_experiments`. **After:** functions of
     `xarray`.
     """
-    blocks = Blocks((draws,), (min(chunk or -(-draws // _PIECES), draws),))
+    length = min(chunk or -(-draws // _PIECES), draws)
+    blocks = Blocks((draws,), (length,))
     return fill(Draws(function, seed, blocks), store, client).dataset()
 
 

@@ -88,7 +88,8 @@ class SweepPoints:
         sequence = qmc.Sobol(len(ranges), rng=np.random.default_rng(seed))
         unit = sequence.random_base2(max(count - 1, 0).bit_length())[:count]
         low, high = np.array(list(ranges.values())).T
-        return cls(dict(zip(ranges, (low + (high - low) * unit).T, strict=True)))
+        values = low + (high - low) * unit
+        return cls(dict(zip(ranges, values.T, strict=True)))
 
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))
@@ -171,7 +172,8 @@ class Family:
 
         **Raises:** `DefinitionError` if `model` returns something else, or a bad system.
         """
-        system = self.system({name: jnp.asarray(x) for name, x in values.items()})
+        numbers = {name: jnp.asarray(x) for name, x in values.items()}
+        system = self.system(numbers)
         if not isinstance(system, HybridSystem):
             raise DefinitionError(
                 "`model` must be a system, or a function of parameters that returns one, not a "

@@ -146,7 +146,8 @@ def _walk(map: ReturnMap, moves: Moves, begin: Lanes, places: _Places) -> _Walk:
     between = np.setdiff1d(passed, places.key[is_replaced])
     keys = np.concatenate([places.first, between, places.key])
     times = np.concatenate([begin.t, moves.t[between], places.t])
-    states = np.concatenate([begin.q, moves.q[:, between], places.q], axis=1)
+    of_moves = moves.q[:, between]
+    states = np.concatenate([begin.q, of_moves, places.q], axis=1)
     order = np.lexsort((times, keys))
     return _Walk(
         key=keys[order],
@@ -165,7 +166,8 @@ def _ends_at_targets(
     at = np.flatnonzero(walk.at_target)
     fired = np.maximum(code[at - 1], -1)
     count = events_before + np.cumsum(code >= 0, dtype=np.int32)
-    ends = lanes.start_lanes(s, walk.t[at], chart[at], walk.q[:, at])
+    states = walk.q[:, at]
+    ends = lanes.start_lanes(s, walk.t[at], chart[at], states)
     ends = ends._replace(events=count[at - 1])
     watched = map.watch(ends, until(ends.t))
     armed = arm(s, ends, watched, period)
@@ -213,8 +215,10 @@ def _places_on(
     time = moves.t[move] + h
     turns = 0
     if not by_clock:
-        turns = np.ceil((begin.t[0] + late - time[0]) / period)
-        is_next = np.append(False, time[1:] <= time[:-1] + late)
+        since = begin.t[0] + late - time[0]
+        turns = np.ceil(since / period)
+        comes_again = time[1:] <= time[:-1] + late
+        is_next = np.append(False, comes_again)
         turns = turns + np.cumsum(is_next)
     time = time + turns * period
     after_event = turns * M + move + 1
@@ -268,7 +272,8 @@ def _until_settled(
         goal = dataclasses.replace(targets, time=moves.t[move] + h)
         end, _ = linear_moves(s, start._replace(h=h[inside]), goal)
         last = change
-        change_of_each = np.abs(end[:, 0] - start.t - h[inside])
+        duration = end[:, 0] - start.t
+        change_of_each = np.abs(duration - h[inside])
         change = change_of_each.max(initial=0.0)
         if not change <= last:
             return None

@@ -183,7 +183,8 @@ def _met(placed: PlacedSections, i: int) -> _Met:
     t, chart, q = cycle.trajectory().dense()
     level = levels_at(s, levels, N, t, chart, q.T)[0, i]
     level[-1] = level[0]  # (the same point, but for rounding)
-    falls = np.flatnonzero((np.diff(level) < 0) & (np.diff(t) > 0))
+    has_duration = np.diff(t) > 0
+    falls = np.flatnonzero((np.diff(level) < 0) & has_duration)
     high = level[falls]
     low = level[falls + 1]
     crossed = falls[(high > 0) & (low <= 0)]
@@ -221,7 +222,9 @@ def _require_turns(phase: families.KinematicPhase, cycle: LimitCycle) -> None:
     names = phase.position, phase.velocity
     center = (0.0, 0.0) if phase.center is None else tuple(phase.center.tolist())
     p, v = (x[~np.isnan(x)] for x in cycle.trajectory()(*names)[1:])
-    angle = np.unwrap(np.arctan2(v - center[1], p - center[0]))
+    height = v - center[1]
+    width = p - center[0]
+    angle = np.unwrap(np.arctan2(height, width))
     if abs(angle[-1] - angle[0]) < np.pi:
         raise ComputationError(
             f"the orbit does not turn about the `center` {center} of the KinematicPhase: it has "
@@ -259,7 +262,9 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     moves = recorded_moves(lanes, placed.tape)
     value, rate = levels_at(s, levels, N, *_along_steps(s, moves, placed.tape))
     level = value.reshape(N, -1, len(moves.t))
-    crosses = (level[:, :-1] > 0) & (level[:, 1:] <= 0)
+    above = level[:, :-1] > 0
+    at_or_below = level[:, 1:] <= 0
+    crosses = above & at_or_below
     falls = crosses & (moves.h > 0)
 
     # Around the section itself, rounding decides the signs.
@@ -268,7 +273,8 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     falls[:, 0] &= ~is_itself
     falls[:, -1] &= ~np.roll(is_itself, -1, axis=1)
 
-    field = slopes(s, lanes.t, lanes.chart, lanes.q, np.zeros((s.nu, 1)))
+    no_input = np.zeros((s.nu, 1))
+    field = slopes(s, lanes.t, lanes.chart, lanes.q, no_input)
     by_time = placed.normal[:, 0]
     by_state = placed.normal[:, 1:]
     on_section = by_time + np.sum(by_state * field.T, axis=1)

@@ -211,7 +211,8 @@ class ArcLength(_Anchored):
         scale: Annotated[Numbers, Reals("n", sign="positive")] | None = None,
     ):
         self.n_sections, self.signals, self.anchor = n_sections, tuple(signals), anchor
-        self.scale = real([1.0] * len(self.signals) if scale is None else scale)
+        ones = [1.0] * len(self.signals)
+        self.scale = real(ones if scale is None else scale)
         require_axes("`scale`", self.scale, {"signals": len(self.signals)})
 
     def check(self, s: Structure) -> None:
@@ -220,7 +221,8 @@ class ArcLength(_Anchored):
 
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
         signals = s.resolve_outputs(self.signals)
-        rates = jax.vmap(lambda *point: _along(s, signals, *point)[1])(*orbit[1:])
+        along = jax.vmap(lambda *point: _along(s, signals, *point)[1])
+        rates = along(*orbit[1:])
         speed = jnp.linalg.norm(rates / self.scale, axis=1)
         mean_speed = (speed + jnp.roll(speed, -1)) / 2
         length = jnp.cumsum(jnp.append(0.0, mean_speed))
@@ -302,11 +304,13 @@ class KinematicPhase(_Anchored):
             position, velocity = self._scaled(signals(a, t, q, u))
             return jnp.arctan2(velocity, position)
 
-        phase, rate = _along(s, angle, *(x[0] for x in orbit[1:]))
+        begin = (x[0] for x in orbit[1:])
+        phase, rate = _along(s, angle, *begin)
         sense = jax.lax.stop_gradient(jnp.sign(rate))
         steps = 2 * jnp.pi * jnp.arange(self.n_sections) / self.n_sections
         angles = self._first(phase) + sense * steps
-        across = sense * jnp.stack([jnp.sin(angles), -jnp.cos(angles)])
+        direction = jnp.stack([jnp.sin(angles), -jnp.cos(angles)])
+        across = sense * direction
         return BoundSections.at_levels(_AngleLevels(self, across), self.n_sections)
 
 
@@ -320,7 +324,8 @@ def _along(s: Structure, function: Callable, t, chart, q) -> tuple[Array, Array]
         def value(t, q):
             return function(a, t, q, u)
 
-        return jax.jvp(value, (t, state), (jnp.ones_like(t), s.field(a, t, state, u)))
+        rates = (jnp.ones_like(t), s.field(a, t, state, u))
+        return jax.jvp(value, (t, state), rates)
 
     return jax.lax.switch(
         chart, [lambda a=a: in_chart(a) for a in range(len(s.charts))]

@@ -108,7 +108,8 @@ def linearize(
     walk = None if family is None else walk_beside(cycle, family)
     if family is not None and walk is not None:
         on_walk = _on_walk if is_inside_program() else _of_walk
-        A, B, C, D, dims, _ = on_walk(cycle, family, tuple(z.items), walk)
+        items = tuple(z.items)
+        A, B, C, D, dims, _ = on_walk(cycle, family, items, walk)
     elif family is not None:
         turn = last_turn(cycle)
         A, B, C, D, dims = _of_family(cycle, family, tuple(z.items), turn)
@@ -229,7 +230,8 @@ def _output_jacobians(
     by_point = namespace(by).moveaxis(by[:, 1:], -1, 0)
     n = 1 + s.d
     embed, _ = placed.frames()
-    return by_point[:, :, :n] @ embed, by_point[:, :, n:]
+    by_state = by_point[:, :, :n] @ embed
+    return by_state, by_point[:, :, n:]
 
 
 class _Departures(AbstractSections):
@@ -253,7 +255,8 @@ class _Departures(AbstractSections):
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
         leave = self.phase.bind(s, orbit).time - self.delay[1]
         step = orbit.period
-        change = leave + self.delay.sum() - self.lag * step / self.phase.n_sections
+        lag = self.lag * step / self.phase.n_sections
+        change = leave + self.delay.sum() - lag
         return BoundSections.at_times(
             jnp.stack([leave, change][: self.parts], axis=1).ravel()
         )
@@ -290,7 +293,9 @@ class Delayed(NamedTuple):
         whole = delay.sum() * phase.n_sections / cycle.period
         lag = stop_gradient(jnp.floor(whole + TOGETHER))
         # (Sections that coincide are refused.)
-        together = not is_traced(cycle, delay) and bool(whole - lag < 2 * TOGETHER)
+        together = False
+        if not is_traced(cycle, delay):
+            together = bool(whole - lag < 2 * TOGETHER)
         family = _Departures(phase, delay, lag, 1 if together else 2)  # type: ignore[call-arg,arg-type]
         model = linearize(cycle, family, outputs, inputs)
         if together:
@@ -298,10 +303,12 @@ class Delayed(NamedTuple):
         A, B, C, D, dims = model.matrices
         after_both = A[1::2] @ B[::2]
         B = jnp.concatenate([B[1::2], after_both], axis=2)
-        D = jnp.concatenate([0 * D[::2], D[::2]], axis=2)
+        even = D[::2]
+        D = jnp.concatenate([0 * even, even], axis=2)
         names = *model.inputs, *(f"{x} before" for x in model.inputs)
         over_both = A[1::2] @ A[::2]
-        model = LDTP(over_both, B, C[::2], D, dims[::2], names, model.outputs)
+        C_of_both = C[::2]
+        model = LDTP(over_both, B, C_of_both, D, dims[::2], names, model.outputs)
         return cls(model, lag, names[: len(names) // 2])
 
     def htf(
@@ -309,7 +316,8 @@ class Delayed(NamedTuple):
     ) -> Complex[Array, "M F ny nu"]:
         """Return the HTFs, also for a traced lag."""
         H = self.model.htf(f, harmonics).H
-        turn = -2j * jnp.pi * f[:, None, None] / self.model.n_sections
+        rates = -2j * jnp.pi * f[:, None, None]
+        turn = rates / self.model.n_sections
         halves = jnp.split(H, H.shape[3] // len(self.inputs), axis=3)
         return sum(jnp.exp((self.lag + k) * turn) * x for k, x in enumerate(halves))
 
@@ -329,7 +337,8 @@ class Delayed(NamedTuple):
         past = first + wide - nu
         if not past:
             return self.model
-        rows = np.tile(np.eye(past + nu), (self.model.n_sections, 1, 1))
+        unit = np.eye(past + nu)
+        rows = np.tile(unit, (self.model.n_sections, 1, 1))
         (B, A), (D, C) = (
             np.split(rows[:, part], [nu], axis=2)
             for part in (slice(past), slice(first, first + wide))

@@ -192,7 +192,8 @@ def _near_events(
     ignored = xp.asarray(
         [*is_scheduled, True]
     )  # (the last one is for moves without an event)
-    when = xp.where(ignored[xp.maximum(tape.code, -1)], xp.nan, tape.t)
+    is_ignored = ignored[xp.maximum(tape.code, -1)]
+    when = xp.where(is_ignored, xp.nan, tape.t)
     at_start = at_one_time(when, starts.t, map.expected).any(axis=0)
     at_end = at_one_time(when, ends.t, map.expected).any(axis=0)
     return xp.isfinite(bound.time) & (at_start | xp.roll(at_end, 1))
@@ -205,8 +206,10 @@ def coordinates_on(
     s = map.structure
     xp = namespace(lanes.t)
     N = len(lanes.t)
-    normal = normals(s, bound, lanes, xp.arange(N), xp.zeros((s.nu, 1)))
-    field = slopes(s, lanes.t, lanes.chart, lanes.q, xp.zeros((s.nu, N)))
+    no_input = xp.zeros((s.nu, 1))
+    normal = normals(s, bound, lanes, xp.arange(N), no_input)
+    no_inputs = xp.zeros((s.nu, N))
+    field = slopes(s, lanes.t, lanes.chart, lanes.q, no_inputs)
     flow = xp.concatenate([xp.ones((1, N)), field])
     share = xp.abs(normal.T * flow)
     is_flat = xp.max(share, axis=0) == 0
@@ -243,7 +246,8 @@ def _bind(
         first_step = stride((0.1 * period / M)[None])
         carry = anchor, first_step, xp.zeros(1, xp.int32)
         times = anchor.t + period * xp.arange(1, M + 1) / M
-        lanes = side_by_side(go(carry, toward(times, -1, times))[1][0])
+        _, begun = go(carry, toward(times, -1, times))
+        lanes = side_by_side(begun[0])
     bound = bind_at(map, family, lanes)
     late = xp.ceil((t - bound.time[0]) / period)
     late = xp.where(xp.isfinite(bound.time[0]), stop_gradient(late), 0.0)

@@ -197,7 +197,8 @@ def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
         result = update_result(result, missed >= 0, Result.EVENT_ORDER)
     failed = result != Result.OK
     n = map.dims[1]
-    arrival = nan_where(failed, xp.concatenate([end.t[None], end.q[:n]]))
+    point = xp.concatenate([end.t[None], end.q[:n]])
+    arrival = nan_where(failed, point)
     return Arrival(arrival[0], arrival[1:], result)
 
 

@@ -6,6 +6,7 @@ from typing import Any, cast
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.compilation import quick_jit
@@ -126,7 +127,8 @@ def place_along(
 
     if isinstance(family.anchor, Crossing):
         levels = ListLevels((cast(Crossing, by_family.anchor),))
-        _, tangents, _ = follow(flows.pop(0), levels, np.zeros((P, 1)))
+        no_times = np.zeros((P, 1))
+        _, tangents, _ = follow(flows.pop(0), levels, no_times)
         x = tangents[-1]
     # The points of the orbit on which the family depends.
     M = family.points
@@ -140,7 +142,8 @@ def place_along(
     )
     if M > 1:
         share = np.arange(1, M + 1) / M
-        times = x[0][:, None] + longer[:, None] * share
+        along_period = longer[:, None] * share
+        times = x[0][:, None] + along_period
         variation, tangents, _ = follow(flows.pop(0), None, times)
         moved_points = tangents[variation.first]
     by_time = np.moveaxis(moved_points[:, 0], 1, 0)
@@ -149,13 +152,13 @@ def place_along(
     raw, by_bound = to_host(_bind_along(s, family, orbit, directions))
     # The flow from section to section, with the times of the sections.
     is_clock = np.isfinite(bound.time)
+    by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
     late = 0.0
     if is_clock[0]:
-        late = np.rint((bound.time[0] - raw.time[0]) / cycle.period)
-    k = np.arange(N + 1)[-len(flows[0][1].time) :]
-    by_time = np.zeros((P, N)) if by_bound.time is None else by_bound.time
-    later = (late + k // N) * longer[:, None]
-    times = is_clock[k % N] * (by_time[:, k % N] + later)
+        shift = bound.time[0] - raw.time[0]
+        late = np.rint(shift / cycle.period)
+    last = np.arange(N + 1)[-len(flows[0][1].time) :]
+    times = _moved_times(is_clock, by_time, longer, late, last)
     variation, tangents, along = follow(flows[0], by_bound.levels, times, True)
     t, chart, q, u = variation.points(tangents, variation.first[-N:])
 
@@ -168,6 +171,27 @@ def place_along(
     rows = dict(drop=many(placed.drop), dims=many(placed.dims), normal=normal)
     moved = dataclasses.replace(placed, bound=bound, lanes=lanes, **rows)
     return moved, along, variation.jacobians(tangents, placed.across)[-N:]
+
+
+def _moved_times(
+    is_clock: Bool[np.ndarray, " N"],
+    by_time: Float[np.ndarray, "P N"],
+    longer: Float[np.ndarray, " P"],
+    late: float,
+    ends: Int[np.ndarray, " k"],
+) -> Float[np.ndarray, "P k"]:
+    """Tangents of the times of sections in P directions; zero for sections of the state.
+
+    **Arguments:** `by_time`: tangents of the times in the first period. `longer`: tangents of the
+    period. `late`: periods by which all sections are later. `ends`: the sections, of which section
+    N is section 0 one period later.
+    """
+    N = len(is_clock)
+    section = ends % N
+    periods = late + ends // N
+    later = periods * longer[:, None]
+    moved = by_time[:, section] + later
+    return is_clock[section] * moved
 
 
 def _observed(

@@ -75,7 +75,8 @@ class PlacedSections(Showable, eqx.Module):
     def section_zero(self) -> Float[Array, " n"]:
         """Time and padded state at which the cycle meets section 0."""
         lanes = self.lanes
-        return namespace(lanes.t).append(lanes.t[0], lanes.q[:, 0])
+        time = lanes.t[0]
+        return namespace(lanes.t).append(time, lanes.q[:, 0])
 
     def __repr__(self):
         system = type(self.cycle.system).__name__
@@ -177,7 +178,8 @@ class PlacedSections(Showable, eqx.Module):
         of_dropped = xp.where(drops, xp.take_along_axis(normal, drop, axis=1), 1.0)
         slope = -normal / of_dropped
         is_dropped = (k == drop) & drops
-        along = xp.where(is_dropped[:, :, None], slope[:, None, :], 0.0)
+        slopes_of_states = slope[:, None, :]
+        along = xp.where(is_dropped[:, :, None], slopes_of_states, 0.0)
         return (unit + along) @ xp.swapaxes(select, 1, 2), select
 
     @property
@@ -319,7 +321,8 @@ def observe(
             mask, [only(mask, x) for x in (lanes.t, lanes.q[: s.dims[a]], u)]
         )
         if on_host(mask):
-            values = kernels.outputs(s, a, tuple(z.items), *point)[:, 0]
+            rows = kernels.outputs(s, a, tuple(z.items), *point)
+            values = rows[:, 0]
         else:
             values = s.by_lane(lambda s, t, q, u: z(a, t, q, u))(*point)
         return xp.where(mask, values, out)

@@ -95,7 +95,8 @@ class Quadratic(NamedTuple):
     ) -> Complex[np.ndarray, "N n K"]:
         """States for a periodic forcing times $e^{2 \\pi i f n/N}$, divided by it."""
         A = self._states
-        back = np.exp(-2j * np.pi * f / len(self.step))
+        angles = -2j * np.pi * f
+        back = np.exp(angles / len(self.step))
 
         def ahead(x, section):
             return (A[section] @ x + forcing[section]) * back
@@ -106,7 +107,8 @@ class Quadratic(NamedTuple):
             x = ahead(x, section)
 
         # The start that returns to itself.
-        back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
+        turns = -2j * np.pi * f
+        back_a_period = np.exp(turns)[:, None, None]
         returned = back_a_period * monodromy(A)
         unit = np.eye(A.shape[-1])
         column = np.linalg.solve(unit - returned, x.T[:, :, None])
@@ -162,7 +164,8 @@ class Quadratic(NamedTuple):
         w_second = w[:, :, begin:]
 
         forcing = _pairs(self.bend, w_first, w_second)
-        y = C @ self._steady(forcing.reshape(N, n, -1), sums.ravel())
+        in_columns = forcing.reshape(N, n, -1)
+        y = C @ self._steady(in_columns, sums.ravel())
         y = y.reshape(N, ny, *sums.shape)
         y = y + _pairs(self.show_bend, w_first, w_second)
         return y.reshape(N, ny, len(first), 2, -1)
@@ -265,7 +268,8 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
     def work(x):
         """(t, q) at the next section, and outputs at this one, for x = (t, q, u)."""
         u = x[n:]
-        begin = eqx.tree_at(lambda y: (y.t, y.q), lanes, (x[0], x[1:n]))
+        point = (x[0], x[1:n])
+        begin = eqx.tree_at(lambda y: (y.t, y.q), lanes, point)
         t, q = replay(s, begin, u, target, tape)
         return jnp.concatenate([t[None], q, observe(s, z, begin, u)])
 

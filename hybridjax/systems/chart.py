@@ -87,7 +87,8 @@ class Chart(eqx.Module):
         """
 
     def __repr__(self):
-        return f"{type(self).__name__}({listed(signals(self.states, self.units))})"
+        states = listed(signals(self.states, self.units))
+        return f"{type(self).__name__}({states})"
 
 
 def _require_names(cls: type) -> None:

@@ -20,7 +20,8 @@ def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
         raise DefinitionError(
             f"Drawing: '{name}' must be numbers in an array, not {show(value)}."
         ) from None
-    fits = [n in (None, m) for n, m in zip(shape, array.shape, strict=False)]
+    pairs = zip(shape, array.shape, strict=False)
+    fits = [n in (None, m) for n, m in pairs]
     if array.ndim != len(shape) or not all(fits):
         text = str(shape).replace("None", "k")
         raise DefinitionError(
@@ -108,9 +109,11 @@ class Drawing(eqx.Module):
         along = b - a
         # (`hypot` takes longer to compile.)
         length = jnp.sqrt(jnp.maximum(along @ along, 1e-18))
-        across = width * jnp.stack([-along[1], along[0]]) / length
+        normal = jnp.stack([-along[1], along[0]])
+        across = width * normal / length
         part = np.array([0.0, *np.linspace(0.15, 0.85, 13), 1.0])
         side = np.zeros(15)
         side[2:13:2] = 1.0
         side[3:13:2] = -1.0
-        return a + part[:, None] * along + side[:, None] * across
+        sideways = side[:, None] * across
+        return a + part[:, None] * along + sideways

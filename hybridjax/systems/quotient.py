@@ -242,7 +242,8 @@ class Symmetric(Derived):
         if not self.half_period:
             return None
         if self.charts()[at.chart].clocked:
-            at = Guess(at.chart, at.state[:-1], at.state[-1])
+            state = at.state[:-1]
+            at = Guess(at.chart, state, at.state[-1])
         if not self.translation:
             return self.system, at
         return Symmetric(self.system, translation=self.translation), at
@@ -294,7 +295,8 @@ class Symmetric(Derived):
             """A function of the original chart, divided by a scale, of a reduced point."""
 
             def of_reduced(t, q, u):
-                state = mirrored(kept, chart.full(size * q[:n], shift or 0.0))
+                whole = chart.full(size * q[:n], shift or 0.0)
+                state = mirrored(kept, whole)
                 value = function(t + later, state, u[used])
                 return value / scale[0] if scale else value
 
@@ -409,7 +411,9 @@ def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list
     def at_a_point(q, t):
         values = []
         for _, first, second in quotient._claims(sizes):
-            values.append((as_vector(first(t, q, u)), as_vector(second(t, q, u))))
+            left = as_vector(first(t, q, u))
+            right = as_vector(second(t, q, u))
+            values.append((left, right))
         return values
 
     return jax.vmap(at_a_point)(q, t)
@@ -466,5 +470,6 @@ class _Reduced(DerivedChart):
         return of_reduced
 
     def field(self, t, q, u):
-        rates = self.less(as_vector(self.lifted(self.chart.field)(t, q, u)))
+        whole = as_vector(self.lifted(self.chart.field)(t, q, u))
+        rates = self.less(whole)
         return jnp.append(rates, 1.0) if self.clocked else rates

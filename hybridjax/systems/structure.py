@@ -343,14 +343,16 @@ class Structure:
     def chart_input(self, a: int, t: ArrayLike, u: Array) -> Array:
         """g_a(û): the inputs that chart a uses."""
         if isinstance(self.system, Driven):
-            u = u + jnp.broadcast_to(jnp.asarray(self.system.drive(t), float), u.shape)
+            drive = jnp.asarray(self.system.drive(t), float)
+            u = u + jnp.broadcast_to(drive, u.shape)
         names = self.charts[a].inputs
         if names is None:
             return u
         return u[np.array([self.inputs.index(n) for n in names], int)]
 
     def field(self, a: int, t: Array, q: Array, u: Array) -> jax.Array:
-        return as_vector(self.charts[a].field(t, q, self.chart_input(a, t, u)))
+        whole_input = self.chart_input(a, t, u)
+        return as_vector(self.charts[a].field(t, q, whole_input))
 
     @property
     def kinds(self) -> list[Kind]:

@@ -129,7 +129,8 @@ class SlidingChart(DerivedChart):
         q = jnp.asarray(q, float)
 
         def along(f):
-            return jax.jvp(self.surface, (t, q), (jnp.ones_like(t), f))[1]
+            rates = (jnp.ones_like(t), f)
+            return jax.jvp(self.surface, (t, q), rates)[1]
 
         return [along(f) for f in self.fields(t, q, u)]
 

@@ -95,7 +95,8 @@ def simulate_recording(
     x = np.concatenate([force, rest], axis=1)
     middle = (np.arange(steps) + 0.5) / steps
     change = np.diff(x, axis=1)[:, :, None]
-    u = x[:, :-1, None] + change * middle[:, None]
+    forced = change * middle[:, None]
+    u = x[:, :-1, None] + forced
     response = response_function(cycle, ClockPhase(K * steps), outputs)
     held = jnp.asarray(u.reshape(S, -1, nu))
     y = np.asarray(_respond(response, held))[:, ::steps]
@@ -106,7 +107,8 @@ def simulate_recording(
     for k in range(S):
         finite = int(np.isfinite(y[k]).all(axis=1).sum())
         good = slice(0, min(n, finite))
-        columns = [*force[k, good].T, *y[k, good].T]
+        forces = force[k, good].T
+        columns = [*forces, *y[k, good].T]
         signals = dict(zip(names, columns, strict=True))
         trials.append(Recording(time[good], signals, units=units, name=f"trial {k}"))
     return Recording.join(trials)
@@ -244,8 +246,10 @@ def simulate_beats(
         begin = force[:, k]
         end = force[:, k + 1]
         u = (1 - part) * begin + part * end
-        z = at(phase + (w + at(phase) * u) * h / 2)  # the middle of the step
-        move: Any = (w + z * u) * h + jitter * np.sqrt(w * h) * rng.standard_normal(S)
+        half_way = phase + (w + at(phase) * u) * h / 2
+        z = at(half_way)  # the middle of the step
+        drawn = jitter * np.sqrt(w * h) * rng.standard_normal(S)
+        move: Any = (w + z * u) * h + drawn
         after = np.maximum(phase + move, 0.0)
         for trial in np.flatnonzero(after >= 1):
             share = (1 - phase[trial]) / move[trial]

@@ -38,13 +38,16 @@ def saved(path, static):
 
 
 def bomb(path):
-    zeros = npy((2**24,), bytes(2**27))
+    block = bytes(2**27)
+    zeros = npy((2**24,), block)
     pack(path, [("time.npy", zeros)], compression=zipfile.ZIP_DEFLATED, compresslevel=9)
 
 
 def overlapping(path):
     """Many entries of the archive's directory that stand for the same data."""
-    pack(path, [("time.npy", npy((2**19,), bytes(2**22)))])
+    shape = (2**19,)
+    zeros = bytes(2**22)
+    pack(path, [("time.npy", npy(shape, zeros))])
     with zipfile.ZipFile(path, "a") as archive:
         entry = archive.infolist()[0]
         for k in range(200):
@@ -105,7 +108,9 @@ def refused(call, path, says):
         tracemalloc.stop()
     assert peak < 2**25
     assert str(path) in str(error.value)
-    assert len(str(error.value)) < 400 + len(str(path))
+    text = str(error.value)
+    longest = 400 + len(str(path))
+    assert len(text) < longest
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
@@ -140,7 +145,8 @@ def test_a_parquet_file_that_declares_more_than_it_holds(tmp_path):
     from pyarrow import parquet
 
     path = tmp_path / "hostile.parquet"
-    values = pyarrow.DictionaryArray.from_arrays(np.zeros(2**24, np.int8), [0.0])
+    indices = np.zeros(2**24, np.int8)
+    values = pyarrow.DictionaryArray.from_arrays(indices, [0.0])
     parquet.write_table(pyarrow.table({"time": values}), path)
     assert path.stat().st_size < 2**20
     refused(

@@ -143,7 +143,8 @@ def test_what_fits_arrives_in_one_form(annotation, given, expected):
 
 def test_arrays_that_may_hold_any_number_are_not_read(monkeypatch):
     monkeypatch.setattr(np, "sum", None)  # (They may lie on disk.)
-    called(Annotated[Numbers, Reals("n", missing=True, infinite=True)], np.zeros(2))
+    hint = Annotated[Numbers, Reals("n", missing=True, infinite=True)]
+    called(hint, np.zeros(2))
 
 
 @pytest.mark.parametrize("annotation, given, said", REFUSED)
@@ -164,7 +165,8 @@ def several(a: int, /, b: Count = 0, *rest: str, c: Literal["x"] = "x", **option
 
 
 def test_every_parameter_is_checked_however_it_is_given():
-    assert several(1, 2, "r", c="x", other=3) == (1, 2, ("r",), "x", {"other": 3})
+    found = several(1, 2, "r", c="x", other=3)
+    assert found == (1, 2, ("r",), "x", {"other": 3})
     for bad, name in [
         (lambda: several("1"), "a"),
         (lambda: several(1, -2), "b"),
@@ -199,7 +201,9 @@ def test_signatures_are_short():
     # (The constructor that `dataclasses` makes has no source; its fields have.)
     fields = str(inspect.signature(hj.scale.Execution))
     assert fields.startswith("(batch: ExperimentCount | None = None, workers: Worker")
-    first_line = pydoc.plain(pydoc.render_doc(hj.run_experiments)).split("\n")[2]
+    text = pydoc.render_doc(hj.run_experiments)
+    page = pydoc.plain(text)
+    first_line = page.split("\n")[2]
     assert len(first_line) < 600
     assert first_line.startswith(
         "run_experiments(cycle: LimitCycle, sections: SectionsLike"
@@ -275,7 +279,8 @@ class Data:
 @pytest.mark.parametrize("cls", [Pair, Data])
 def test_named_tuples_and_dataclasses_are_checked(cls):
     assert type(cls(1).first) is float
-    assert pickle.loads(pickle.dumps(cls(1))) == cls(1)
+    copied = pickle.loads(pickle.dumps(cls(1)))
+    assert copied == cls(1)
     with pytest.raises(
         hj.errors.DefinitionError, match=f"^{cls.__name__}: `second` must be a string"
     ):
@@ -302,9 +307,13 @@ def around(x: Annotated[Numbers, Reals("n")]):
 def test_arrays_may_be_traced():
     x = jnp.arange(1.0, 4.0)
     assert jax.jit(summed)(x) == 6
-    assert jax.grad(lambda s: summed(x, s))(2.0) == 6
-    assert jax.grad(lambda s: summed([s, 1.0], s))(2.0) == 5
-    assert_array_equal(jax.vmap(summed)(jnp.stack([x, x])), [6, 6])
+    found = jax.grad(lambda s: summed(x, s))(2.0)
+    assert found == 6
+    slope = jax.grad(lambda s: summed([s, 1.0], s))(2.0)
+    assert slope == 5
+    stacked = jnp.stack([x, x])
+    sums = jax.vmap(summed)(stacked)
+    assert_array_equal(sums, [6, 6])
     with pytest.raises(
         hj.errors.DefinitionError, match=r"^summed: `x` must be of shape \(n,\)"
     ):
@@ -331,4 +340,5 @@ def test_where_values_are_needed_a_sentence_says_so(transform):
             match=f"^{name} needs values, but JAX traces them",
         ):
             transform(function)(x)
-    assert eqx.filter_jit(lambda n: several(1, n))(2) == (1, 2, (), "x", {})
+    program = eqx.filter_jit(lambda n: several(1, n))
+    assert program(2) == (1, 2, (), "x", {})

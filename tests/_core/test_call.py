@@ -38,7 +38,8 @@ class Slowed(hj.HybridSystem):
         k = DRAG[0] if self.water is None else self.water.drag
 
         def force(t, u):
-            return jnp.cos(2 * jnp.pi * t) + self.wind + u[0]
+            push = jnp.cos(2 * jnp.pi * t)
+            return push + self.wind + u[0]
 
         def air_rates(t, q, u):
             return (force(t, u) - k * q[0],)

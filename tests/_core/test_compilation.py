@@ -91,7 +91,9 @@ def test_functions_that_are_written_anew_share_a_program(compiled):
         job(X[:2], lambda x: 2 * x, 1),
         job(X, jnp.cos, 4),
     ]
-    assert_allclose([x.sum for x in values], [10, 3, jnp.cos(X).sum() + 4])
+    sums = [x.sum for x in values]
+    of_cosine = jnp.cos(X).sum() + 4
+    assert_allclose(sums, [10, 3, of_cosine])
     assert len(compiled) == 4
 
 
@@ -99,14 +101,16 @@ def test_a_large_job_does_not_wait_for_a_program_of_a_small_one(compiled):
     """Both have a program of their own, and lower the function once."""
     small = Program(total, loops=False)
     large = Program(total, loops=True)
-    results = [job(X, jnp.sin, 1).sum for job in (small, large, small, large)]
+    turns = (small, large, small, large)
+    results = [job(X, jnp.sin, 1).sum for job in turns]
     assert_allclose(results, jnp.sin(X).sum() + 1)
     assert compiled == [jax_compat.quick_options(), jax_compat.loop_options()]
     assert len(compilation._by_kind) == 1
 
 
 def point(power, tree, x, y):
-    return tree["k"] * 3.0 * jnp.sin(x) ** power + y
+    wave = jnp.sin(x) ** power
+    return tree["k"] * 3.0 * wave + y
 
 
 def plain(function, *trees):
@@ -119,14 +123,19 @@ def test_a_kernel_of_any_number_of_lanes(lanes):
     y = np.ones((1, 1))
     before = len(compilation._kernels)
     for k in (1.0, 2.0):
-        values = kernel(point, plain, (2,), ({"k": jnp.asarray(k)},), lanes)(x, y)
-        assert_allclose(values, k * 3 * np.sin(x) ** 2 + y, rtol=1e-15)
+        constants = {"k": jnp.asarray(k)}
+        run = kernel(point, plain, (2,), (constants,), lanes)
+        values = run(x, y)
+        waves = k * 3 * np.sin(x) ** 2
+        expected_values = waves + y
+        assert_allclose(values, expected_values, rtol=1e-15)
     assert len(compilation._kernels) == before + 1
     some = np.array([False, True, False, True])
     values = kernel(point, plain, (2,), ({"k": jnp.asarray(1.0)},), lanes)(
         x, y, some=some
     )
-    expected = (3 * np.sin(x) ** 2 + y)[:, some]
+    all_lanes = 3 * np.sin(x) ** 2 + y
+    expected = all_lanes[:, some]
     assert_allclose(values[:, some], expected, rtol=1e-15)
 
 
@@ -134,7 +143,8 @@ def test_programs_that_call_lapack_take_turns():
     A = np.eye(2)
     Program(jnp.linalg.eigvals, False)(A)
     Program(jnp.linalg.matmul, False)(A, A)
-    alone = {key[0]: program.alone for key, program in compilation._by_kind.items()}
+    programs = compilation._by_kind.items()
+    alone = {key[0]: program.alone for key, program in programs}
     assert alone[jnp.linalg.eigvals]
     assert not alone[jnp.linalg.matmul]
     inside = []
@@ -189,7 +199,8 @@ def test_programs_are_not_unpickled(monkeypatch):
         monkeypatch.delattr(pickle, name)
     for _ in range(2):
         events.clear()
-        jax.jit(lambda x: x + 1.2345).lower(jnp.ones(7)).compile()
+        program = jax.jit(lambda x: x + 1.2345)
+        program.lower(jnp.ones(7)).compile()
     assert "/jax/compilation_cache/cache_hits" in events
 
 
@@ -282,7 +293,8 @@ print(hj.run_experiments(cycle, hj.ClockPhase(4), u, ("x",), discard=0, executio
 
 
 def run(code: str, **environment: str) -> str:
-    before = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    variables = os.environ.items()
+    before = {k: v for k, v in variables if k != "XLA_FLAGS"}
     environment = before | {"JAX_PLATFORMS": "cpu"} | environment
     return run_python("-c", code, env=environment, timeout=900)
 

@@ -15,7 +15,8 @@ linalg = jax.scipy.linalg
 
 
 def definite(A):
-    return A @ A.T + 0.1 * jnp.eye(len(A))
+    square = A @ A.T
+    return square + 0.1 * jnp.eye(len(A))
 
 
 def by_cholesky(A, b):
@@ -51,7 +52,8 @@ def test_values_and_derivatives_are_those_of_lapack(name):
 
     program = jax.jit(value_and_gradient(by_lane(function)))
     assert "lapack" not in program.lower(A, b).as_text()
-    theirs = jax.jit(value_and_gradient(jax.vmap(function, -1, -1)))(A, b)
+    of_lanes = value_and_gradient(jax.vmap(function, -1, -1))
+    theirs = jax.jit(of_lanes)(A, b)
     for x, y in zip(program(A, b), theirs, strict=True):
         tolerance = 1e-9 * np.abs(y).max()
         assert_allclose(x, y, rtol=1e-9, atol=tolerance)
@@ -63,8 +65,10 @@ def test_values_and_derivatives_are_those_of_lapack(name):
     ids=["qr", "eigh", "svd"],
 )
 def test_other_factorizations_are_left_to_lapack(function):
-    A = definite(samples(4)[0][..., 1])
-    assert "lapack" in jax.jit(vectorized(function)).lower(A).as_text()
+    sample = samples(4)[0][..., 1]
+    A = definite(sample)
+    lowered = jax.jit(vectorized(function)).lower(A)
+    assert "lapack" in lowered.as_text()
 
 
 def test_matrices_that_are_not_positive_are_seen():
@@ -74,4 +78,6 @@ def test_matrices_that_are_not_positive_are_seen():
     x = jax.jit(jax.vmap(solve_positive))(
         jnp.stack([*matrices, tiny]), jnp.ones((4, 2))
     )
-    assert_allclose(x, [[np.nan] * 2] * 3 + [[1e30] * 2], rtol=1e-15)
+    unknown = [[np.nan] * 2] * 3
+    known = [[1e30] * 2]
+    assert_allclose(x, unknown + known, rtol=1e-15)

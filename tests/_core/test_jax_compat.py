@@ -80,7 +80,8 @@ def test_primitives_of_inner_programs():
 def test_needed_part():
     program = program_of(lambda x, y, z: (jnp.sin(y), 0 * x)[0], 1.0, 2.0, 3.0)
     needed, uses = jax_compat.needed_part(program)
-    assert uses == [False, True, False] and len(needed.invars) == 1
+    assert uses == [False, True, False]
+    assert len(needed.invars) == 1
     needed, _ = jax_compat.needed_part(program, every_argument=True)
     assert len(needed.invars) == 3
     assert jax_compat.primitives_of(needed) == {"sin"}
@@ -92,22 +93,29 @@ def test_changed_programs_run():
     cosine = jax_compat.in_place_of(first, only_equation(jnp.cos, 2.0), first.invars)
     program = jax_compat.with_equations(whole.jaxpr, [cosine, second])
     run = jax_compat.as_function(jax_compat.with_program(whole, program))
-    np.testing.assert_allclose(run(2.0)[0], np.cos(2.0) + 1.0)
+    found = run(2.0)[0]
+    expected = np.cos(2.0) + 1.0
+    np.testing.assert_allclose(found, expected)
 
 
 def test_variables_and_constants():
     equation = only_equation(lambda x: x + 1.0, 2.0)
     x, one = equation.invars
-    assert jax_compat.is_variable(x) and not jax_compat.is_constant(x)
-    assert jax_compat.is_constant(one) and one.val == 1.0
+    assert jax_compat.is_variable(x)
+    assert not jax_compat.is_constant(x)
+    assert jax_compat.is_constant(one)
+    assert one.val == 1.0
     assert jax_compat.bits_of(x) == 64
-    assert jax_compat.bits_of(only_equation(lambda k: k + k, 1).invars[0]) is None
+    doubled = only_equation(lambda k: k + k, 1)
+    bits = jax_compat.bits_of(doubled.invars[0])
+    assert bits is None
 
 
 def test_lines_of_an_equation():
     lines = jax_compat.lines_of(only_equation(lambda x: jnp.sin(x), 1.0))
     here = [line for file, line in lines if file == __file__]
-    text = pathlib.Path(__file__).read_text().splitlines()[here[0] - 1]
+    source = pathlib.Path(__file__).read_text()
+    text = source.splitlines()[here[0] - 1]
     assert "jnp.sin(x)" in text
 
 
@@ -123,7 +131,8 @@ def test_names_of_functions(name):
 
 
 def test_names_of_other_functions():
-    assert jax_compat.function_of(only_equation(jax.lax.atan2, 1.0, 2.0)) == "arctan2"
+    angle = only_equation(jax.lax.atan2, 1.0, 2.0)
+    assert jax_compat.function_of(angle) == "arctan2"
     joined = only_equation(lambda x: jax.lax.concatenate([x, x], 0), X)
     assert jax_compat.function_of(joined) == "vector"
     assert jax_compat.function_of(only_equation(jax.lax.exp, 1.0)) == ""
@@ -142,13 +151,16 @@ def test_parts_of_a_linear_system():
         (program,) = (p for x in program.eqns for p in jax_compat.inner_programs(x))
     (system,) = [x for x in program.eqns if jax_compat.function_of(x) == "solve"]
     matrix, right, factors, product = jax_compat.solved_by(system)
-    assert matrix.aval.shape == (3, 3) and right.aval.shape == (3,)
-    assert factors and jax_compat.function_of(product) == "product"
+    assert matrix.aval.shape == (3, 3)
+    assert right.aval.shape == (3,)
+    assert factors
+    assert jax_compat.function_of(product) == "product"
 
 
 def test_calls_and_rules():
     jitted = only_equation(jax.jit(jnp.sin), 1.0)
-    assert jax_compat.is_call(jitted) and jax_compat.is_outer(jitted)
+    assert jax_compat.is_call(jitted)
+    assert jax_compat.is_outer(jitted)
 
     @jax.custom_jvp
     def with_rule(x):
@@ -201,12 +213,16 @@ def test_suddenness(how):
     (equation, *_) = program_of(SUDDEN[how], 1.0, 2.0).eqns
     while jax_compat.inner_programs(equation):
         (equation,) = jax_compat.inner_programs(equation)[0].eqns
-    assert jax_compat.suddenness(equation, [True] * len(equation.invars)) == [how]
+    varies = [True] * len(equation.invars)
+    found = jax_compat.suddenness(equation, varies)
+    assert found == [how]
 
 
 def test_smooth_operations():
-    for equation in program_of(lambda x: jnp.sum(x * jnp.sin(x) - 1.0), X).eqns:
-        assert jax_compat.suddenness(equation, [True] * len(equation.invars)) == []
+    smooth = program_of(lambda x: jnp.sum(x * jnp.sin(x) - 1.0), X)
+    for equation in smooth.eqns:
+        varies = [True] * len(equation.invars)
+        assert jax_compat.suddenness(equation, varies) == []
 
 
 # LAPACK -----------------------------------------------------------------------------------------
@@ -249,7 +265,8 @@ def test_programs_of_lapack_are_recognized(name, inside):
 
 
 def test_every_public_factorization_is_in_the_table():
-    public = {x for x in dir(jax.lax.linalg) if not x.startswith("_")}
+    everything = dir(jax.lax.linalg)
+    public = {x for x in everything if not x.startswith("_")}
     without_lapack = {"lu_pivots_to_permutation", "qdwh"}
     known = jax_compat._LAPACK | without_lapack
     names = {x for x in public if not x.endswith("_p") and not x[0].isupper()}
@@ -269,13 +286,15 @@ def test_inside_and_outside():
 
     def function(x):
         inside.append(jax_compat.is_outside())
-        assert jax_compat.is_tracer(x) and jax_compat.is_tracer(x + 1)
+        assert jax_compat.is_tracer(x)
+        assert jax_compat.is_tracer(x + 1)
         with jax_compat.outside():
             assert not jax_compat.is_tracer(jnp.sin(1.0))
         return x
 
     jax.jit(function)(1.0)
-    assert inside == [False] and jax_compat.is_outside()
+    assert inside == [False]
+    assert jax_compat.is_outside()
 
 
 def test_own_traces():
@@ -295,7 +314,8 @@ def test_settings():
         assert jax_compat.settings_of_programs() != before
     with jax.disable_jit():
         assert not jax_compat.runs_programs_as_they_are()
-    assert jax_compat.runs_programs_as_they_are() and jax_compat.combines_as_numpy()
+    assert jax_compat.runs_programs_as_they_are()
+    assert jax_compat.combines_as_numpy()
     with jax.numpy_rank_promotion("raise"):
         assert not jax_compat.combines_as_numpy()
     with jax.default_device(jax.devices("cpu")[0]):
@@ -339,6 +359,9 @@ def test_a_branch_on_some_lanes_stays_a_branch_under_vmap():
         return jax.lax.cond(some, lambda: jnp.ones(()), lambda: jnp.zeros(()))
 
     masks = jnp.array([[False, True], [False, False]])
-    assert "select_n" not in str(jax.make_jaxpr(jax.vmap(function))(masks))
-    assert jax.vmap(function)(masks).tolist() == [1.0, 1.0]
-    assert jax.vmap(function)(masks[1:]).tolist() == [0.0]
+    program = jax.make_jaxpr(jax.vmap(function))(masks)
+    assert "select_n" not in str(program)
+    found_values = jax.vmap(function)(masks)
+    assert found_values.tolist() == [1.0, 1.0]
+    found = jax.vmap(function)(masks[1:])
+    assert found.tolist() == [0.0]

@@ -8,7 +8,9 @@ from hybridjax._core.loops import loop, pushed
 
 
 def step(constants, k, x, steps):
-    return jnp.sin(constants["a"] * x) + k * x**2 / 10, steps + 1
+    wave = jnp.sin(constants["a"] * x)
+    drift = k * x**2 / 10
+    return wave + drift, steps + 1
 
 
 def step_along(constants, by_constants, k, x, columns, steps):
@@ -19,7 +21,8 @@ def step_along(constants, by_constants, k, x, columns, steps):
 
 
 def with_own_derivatives(a, x):
-    end, steps = loop(step, step_along, {"a": a}, x, jnp.asarray(0.0), 7)
+    start = jnp.asarray(0.0)
+    end, steps = loop(step, step_along, {"a": a}, x, start, 7)
     return end
 
 
@@ -43,6 +46,7 @@ def test_first_and_second_derivatives_are_those_of_jax():
 def test_lanes_have_derivatives_of_their_own():
     a = jnp.array([0.7, 1.3, 2.0])
     x = jnp.array([0.2, -0.4])
-    slopes = jax.vmap(jax.jacfwd(with_own_derivatives), in_axes=(0, None))(a, x)
+    slope = jax.jacfwd(with_own_derivatives)
+    slopes = jax.vmap(slope, in_axes=(0, None))(a, x)
     expected = [jax.jacfwd(with_derivatives_of_jax)(each, x) for each in a]
     np.testing.assert_allclose(slopes, expected, rtol=1e-13)

@@ -453,8 +453,10 @@ CASES = [(kind, k) for kind, ways in CHANGES.items() for k in range(len(ways))]
 def made(code, name="users_cells"):
     """The names of a module in which a program and a system that uses it have been executed."""
     module = types.ModuleType(name)
-    exec(compile(SYSTEM, f"{name}.py", "exec"), vars(module))
-    exec(compile(code, f"{name}.py", "exec"), vars(module))
+    system_code = compile(SYSTEM, f"{name}.py", "exec")
+    exec(system_code, vars(module))
+    user_code = compile(code, f"{name}.py", "exec")
+    exec(user_code, vars(module))
     return vars(module)
 
 
@@ -570,8 +572,10 @@ def test_systems_that_differ_in_numbers_of_their_classes_share_nothing():
 
     for k in (1.0, 1.0 + 1e-15, 2.0):
         way = hj.simulate(system(k), "line", (0.0, 0.0), 2.0)
-        assert_allclose(way.after[-1], [2 * k, 2.0], rtol=1e-12)
-    digests = [code_digest(system(k)) for k in (1.0, 1.0, 1.0 + 1e-15, 2.0)]
+        expected = [2 * k, 2.0]
+        assert_allclose(way.after[-1], expected, rtol=1e-12)
+    factors = (1.0, 1.0, 1.0 + 1e-15, 2.0)
+    digests = [code_digest(system(k)) for k in factors]
     assert digests[0] == digests[1]
     assert len(set(digests)) == 3
 
@@ -704,4 +708,5 @@ def test_parts_of_one_name_are_all_compared():
         return type("Made", (hj.HybridSystem,), names)()
 
     pairs = [(1.0, 2.0), (3.0, 2.0), (1.0, 3.0), (2.0, 1.0)]
-    assert len({code_digest(system(*pair)) for pair in pairs}) == 4
+    digests = {code_digest(system(*pair)) for pair in pairs}
+    assert len(digests) == 4

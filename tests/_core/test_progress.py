@@ -43,7 +43,8 @@ def test_a_terminal_is_watched_and_a_log_is_not(monkeypatch):
             time.sleep(0.2)
     assert "call, 00:00" in terminal.getvalue()
     assert log.getvalue() == ""
-    assert terminal.getvalue().split("\r")[-2].strip() == ""
+    lines = terminal.getvalue().split("\r")
+    assert lines[-2].strip() == ""
 
 
 def test_the_outermost_call_has_the_line_and_parts_say_what_they_do(capsys, shown):

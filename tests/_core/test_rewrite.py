@@ -39,11 +39,13 @@ def looped(x, y):
 def test_vectorized_replaces_everything():
     assert left(looped, 0.3, 0.7)
     assert not left(vectorized(looped), 0.3, 0.7)
-    assert_allclose(vectorized(looped)(0.3, 0.7), looped(0.3, 0.7), rtol=1e-13)
+    found = vectorized(looped)(0.3, 0.7)
+    assert_allclose(found, looped(0.3, 0.7), rtol=1e-13)
 
 
 def test_other_types_and_requested_accuracies_stay():
-    assert left(vectorized(jnp.sin), jnp.float16(1)) == {"sin"}
+    operations = left(vectorized(jnp.sin), jnp.float16(1))
+    assert operations == {"sin"}
     exact = ft.partial(jax.lax.sin, accuracy=jax.lax.AccuracyMode.HIGHEST)
     assert left(vectorized(exact), 1.0) == {"sin"}
 
@@ -70,9 +72,8 @@ def test_types_are_kept():
             jax.tree.leaves(ours), jax.tree.leaves(truth), strict=True
         ):
             assert found.weak_type == expected.weak_type
-    assert all(
-        isinstance(v, jax.Array) for v in vectorized(lambda x: (x, 2.0, x + 1))(0.5)
-    )
+    for v in vectorized(lambda x: (x, 2.0, x + 1))(0.5):
+        assert isinstance(v, jax.Array)
 
 
 def test_closures_over_tracers():
@@ -108,7 +109,8 @@ def test_every_call_sees_the_present_parameters_and_traces_once():
 
 def test_off_away_from_cpu(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert left(vectorized(looped), 0.3, 0.7) == left(looped, 0.3, 0.7)
+    operations = left(vectorized(looped), 0.3, 0.7)
+    assert operations == left(looped, 0.3, 0.7)
 
 
 def test_vectors_of_several_functions_are_put_together_row_by_row():
@@ -121,12 +123,14 @@ def test_vectors_of_several_functions_are_put_together_row_by_row():
 
     t = jnp.asarray(0.7)
     q = jnp.array([0.3, -1.2])
-    program = str(jax.make_jaxpr(vectorized(field))(t, q))
+    jaxpr = jax.make_jaxpr(vectorized(field))(t, q)
+    program = str(jaxpr)
     assert "stack[" not in program.replace("_stack[", "")
     assert program.count("concatenate[") == 1  # with one function behind it
     for new, old in zip(vectorized(field)(t, q), field(t, q), strict=True):
         assert_allclose(new, old, rtol=1e-15)
-    new = jax.jacfwd(vectorized(field))(t, q)[0]
+    slope = jax.jacfwd(vectorized(field))
+    new = slope(t, q)[0]
     old = jax.jacfwd(field)(t, q)[0]
     assert_allclose(new, old, rtol=1e-14)
 
@@ -192,5 +196,6 @@ def test_a_zoo_of_functions_gives_what_it_gave_before():
     for (path, a), b in pairs:
         assert a.dtype == b.dtype
         assert a.shape == b.shape
-        atol = tolerance * max(1.0, np.abs(b).max())
+        largest = max(1.0, np.abs(b).max())
+        atol = tolerance * largest
         assert_allclose(a, b, rtol=tolerance, atol=atol, err_msg=str(path))

@@ -58,8 +58,10 @@ def test_results_stand_beside_what_is_there(full):
     before = tree(full)
     write(full, RESULTS)
     after = tree(full)
-    assert {k: v for k, v in after.items() if k in before} == before
-    assert {k: v for k, v in after.items() if k not in before and k != LIST} == RESULTS
+    kept = {k: v for k, v in after.items() if k in before}
+    assert kept == before
+    added = {k: v for k, v in after.items() if k not in before and k != LIST}
+    assert added == RESULTS
 
 
 def test_later_results_take_the_place_of_earlier_ones(full):
@@ -68,8 +70,10 @@ def test_later_results_take_the_place_of_earlier_ones(full):
     after = tree(full)
     assert after["report.html"] == "new page"
     assert "figures/old.png" not in after
-    assert all(after[name] == text for name, text in MINE.items())
-    assert set(json.loads(after[LIST])) == set(RESULTS)
+    for name, text in MINE.items():
+        assert after[name] == text
+    listed = json.loads(after[LIST])
+    assert set(listed) == set(RESULTS)
 
 
 def link_to_away(folder):
@@ -116,7 +120,8 @@ def test_nothing_is_written_through_a_link_to_a_folder(full):
 
 def test_a_list_with_names_outside_touches_nothing_there(full):
     away = full.parent / "away" / "file"
-    (full / LIST).write_text(json.dumps(["../away/file", str(away)]))
+    places = ["../away/file", str(away)]
+    (full / LIST).write_text(json.dumps(places))
     write(full, RESULTS)
     assert away.read_text() == "away"
 
@@ -148,7 +153,8 @@ def test_an_interruption_while_results_take_their_places(full, monkeypatch):
     monkeypatch.undo()
     assert all((full / name).exists() for name in RESULTS)
     write(full, new)
-    assert {k: v for k, v in tree(full).items() if v == "new"} == new
+    replaced = {k: v for k, v in tree(full).items() if v == "new"}
+    assert replaced == new
     assert not [
         name for name in tree(full) if name.startswith(".hybridjax-") and name != LIST
     ]
@@ -172,7 +178,8 @@ def test_nothing_is_written_through_a_link(tmp_path, writer, name):
         writer(folder / name)
     assert (tmp_path / "away").read_text() == "mine"
     assert (folder / name).is_symlink()
-    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    hidden = [path for path in folder.iterdir() if path.name.startswith(".")]
+    assert not hidden
     (folder / name).unlink()
     os.mkfifo(folder / name)
     with pytest.raises(hj.errors.DefinitionError, match="is a link or a device"):

@@ -12,14 +12,20 @@ TWO_NOISE = {"y0": 0.01, "y1": 0.02}
 @pytest.fixture(scope="session")
 def model():
     """Two states, slow and with little damping, with inputs and outputs in rotating directions."""
-    rotation = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    c = np.cos(0.3)
+    s = np.sin(0.3)
+    rotation = np.array([[c, -s], [s, c]])
     A = np.broadcast_to(0.97 * rotation, (8, 2, 2))
     angle = 2 * np.pi * np.arange(8) / 8
-    push = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    along = np.cos(angle)
+    across = np.sin(angle)
+    push = np.stack([along, across], axis=1)
     x = np.ones((8, 2))
-    v = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    sine = np.sin(angle)
+    v = np.stack([sine, np.cos(angle)], axis=1)
     C = np.stack([x, v], axis=1)
-    return hj.linear.LDTP(A, push[:, :, None], C, inputs="u", outputs=("x", "v"))
+    B = push[:, :, None]
+    return hj.linear.LDTP(A, B, C, inputs="u", outputs=("x", "v"))
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +51,8 @@ def expected_htf(model, design, noise, harmonics=None):
     """Return the exact HTFs at the lines of a design, with the variance of their estimates."""
     htf = model.htf(design.frequencies, harmonics)
     of_unit_noise = design.expected_variance()[:, None, :]
-    of_outputs = np.square(list(noise.values()))[:, None]
+    squares = np.square(list(noise.values()))
+    of_outputs = squares[:, None]
     variance = np.broadcast_to(of_unit_noise * of_outputs, htf.H.shape)
     return dataclasses.replace(htf, variance=variance)
 

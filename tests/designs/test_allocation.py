@@ -27,7 +27,8 @@ def criterion(slopes):
 
 def limits(cost, curved=None):
     cost = np.atleast_2d(cost)
-    empty = np.zeros((0, cost.shape[1], cost.shape[1]))
+    n = cost.shape[1]
+    empty = np.zeros((0, n, n))
     return PowerLimits(
         tuple("abc"[: len(cost)]), cost, empty if curved is None else curved
     )
@@ -44,7 +45,8 @@ def test_several_limits(linear, quadratic):
     cost = rng.uniform(0.2, 2, (linear, 14))
 
     def value(p):
-        return np.trace(np.linalg.inv(slopes * p @ slopes.T))
+        information = slopes * p @ slopes.T
+        return np.trace(np.linalg.inv(information))
 
     within = {"type": "ineq", "fun": lambda p: 1 - np.append(cost @ p, curved @ p @ p)}
     other = minimize(
@@ -57,7 +59,8 @@ def test_several_limits(linear, quadratic):
     )
     allowed = limits(cost, curved)
     result = allocate(criterion(slopes), allowed, np.ones(14))
-    assert allowed.use(result.power).max() == pytest.approx(1)
+    used = allowed.use(result.power)
+    assert used.max() == pytest.approx(1)
     assert 1 - 1e-9 < result.certificate.excess < 1.021
     least = result.bound.criterion
     assert (
@@ -67,12 +70,15 @@ def test_several_limits(linear, quadratic):
     )
     assert value(result.power) == pytest.approx(least)
     poor = allowed.scaled(np.ones(14))
-    excess = certify(criterion(slopes).bound(poor), poor, allowed).excess
-    assert excess * (1 + 1e-6) > value(poor) / other.fun
+    bound = criterion(slopes).bound(poor)
+    excess = certify(bound, poor, allowed).excess
+    lost = value(poor) / other.fun
+    assert excess * (1 + 1e-6) > lost
 
 
 def test_unidentifiable_unknowns_are_named():
-    same = criterion(np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]]))
+    rows = np.array([[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]])
+    same = criterion(rows)
     with pytest.raises(
         hj.errors.DefinitionError, match=r"no response changes along .*x0 .*x1"
     ):

@@ -38,7 +38,8 @@ class Quadratic(hj.HybridSystem):
 
     def transitions(self):
         def reset(t, q, u):
-            return (0.6 * q[0] + u[0] + self.b * q[0] ** 2,)
+            square = self.b * q[0] ** 2
+            return (0.6 * q[0] + u[0] + square,)
 
         return (
             hj.Transition(
@@ -57,13 +58,21 @@ def two_charts():
     """Charts with one and with two states, two inputs, and an output that depends on both."""
 
     def up(t, q, u):
-        return 0.6 * q[0] + u[0] + 0.3 * q[0] * u[1], 0.5 * q[0] ** 2 + u[1]
+        product = 0.3 * q[0] * u[1]
+        x = 0.6 * q[0] + u[0] + product
+        square = 0.5 * q[0] ** 2
+        y = square + u[1]
+        return x, y
 
     def down(t, q, u):
-        return (0.5 * q[0] - q[1] + 0.2 * u[0] * u[1] + 0.4 * q[1] ** 2,)
+        linear = 0.5 * q[0] - q[1]
+        product = 0.2 * u[0] * u[1]
+        return (linear + product + 0.4 * q[1] ** 2,)
 
     def shown(t, q, u):
-        return q[0] + u[1] + q[0] * u[0] + 2 * u[1] ** 2 + 0.5 * u[0] * u[1]
+        by_input = q[0] * u[0]
+        square = 2 * u[1] ** 2
+        return q[0] + u[1] + by_input + square + 0.5 * u[0] * u[1]
 
     def one_rates(t, q, u):
         return (0.0 * q[0],)
@@ -101,7 +110,8 @@ def quadratic():
 
 @pytest.fixture(scope="module")
 def two():
-    cycle = hj.find_limit_cycle(two_charts(), hj.Guess("one", (0.0,), time=0.75))
+    guess = hj.Guess("one", (0.0,), time=0.75)
+    cycle = hj.find_limit_cycle(two_charts(), guess)
     sections = hj.ClockPhase(4)
     return cycle, sections, hj.linearize(cycle, sections, ("x", "z"))
 
@@ -126,9 +136,12 @@ def test_the_even_part_of_the_hopper(hopper_cycle):
         u = EXPERIMENTS.scaled(rms=rms).signals()
         even = even_part(hopper_cycle, sections, u, OUTPUTS)
         wrong = even - quadratic.second_order(u)
-        left.append(np.sqrt(np.mean(wrong**2) / np.mean(even**2)))
+        wrong_power = np.mean(wrong**2)
+        even_power = np.mean(even**2)
+        left.append(np.sqrt(wrong_power / even_power))
     assert left[0] < 1e-3
-    assert left[1] / left[0] == pytest.approx(4, rel=0.1)
+    ratio = left[1] / left[0]
+    assert ratio == pytest.approx(4, rel=0.1)
 
 
 @pytest.mark.slow
@@ -136,9 +149,11 @@ def test_without_a_clock(vanderpol_cycle):
     """Sections on which no time is kept, and the direction of the flow means nothing."""
     sections = hj.KinematicPhase(4, "x", "v", anchor=hj.Crossing("v", "falling"))
     quadratic = second_order(vanderpol_cycle, sections, ("x", "v"), ("u",))
-    u = hj.multisine(4, periods=4, frequencies=(0.0, 2.0)).scaled(rms=1e-3).signals()
+    design = hj.multisine(4, periods=4, frequencies=(0.0, 2.0))
+    u = design.scaled(rms=1e-3).signals()
     even = even_part(vanderpol_cycle, sections, u, ("x", "v"))
-    error = np.abs(even - quadratic.second_order(u)).max()
+    expected = quadratic.second_order(u)
+    error = np.abs(even - expected).max()
     assert error < 1e-4 * np.abs(even).max()
 
 
@@ -149,10 +164,12 @@ def test_two_inputs(two, inputs):
     cycle, sections, _ = two
     quadratic = second_order(cycle, sections, ("x", "z"), inputs)
     everything = SHORT.signals()
-    u = everything[:, :, [SHORT.inputs.index(name) for name in inputs]]
+    columns = [SHORT.inputs.index(name) for name in inputs]
+    u = everything[:, :, columns]
     of_system = np.zeros_like(everything)
     for k, name in enumerate(inputs):
-        of_system[:, :, ("push", "pull").index(name)] = u[:, :, k]
+        column = ("push", "pull").index(name)
+        of_system[:, :, column] = u[:, :, k]
     even = even_part(cycle, sections, of_system, ("x", "z"))
     tolerance = 1e-5 * np.abs(even).max()
     assert_allclose(quadratic.second_order(u), even, rtol=0, atol=tolerance)
@@ -163,7 +180,9 @@ def require_mean_square(outputs, count, expected, precision):
     in_time = np.mean(outputs**2, axis=1)
     each = in_time.reshape(count, -1, 2).mean(axis=1)
     standard_error = np.std(each, axis=0) / np.sqrt(count)
-    assert (np.abs(np.mean(each, axis=0) - expected) < 3.5 * standard_error).all()
+    mean = np.mean(each, axis=0)
+    error = np.abs(mean - expected)
+    assert (error < 3.5 * standard_error).all()
     assert (standard_error < precision * expected).all()
 
 
@@ -213,13 +232,17 @@ def test_one_cosine_in_closed_form(quadratic, f):
     z = np.exp(2j * np.pi * f)
     x1 = amplitude / np.abs(z - 0.6)
     mean = 0.7 * x1**2 / 2 / 0.4
-    twice = 0.7 * x1**2 / 2 / np.abs(z**2 - 0.6)
+    distance = np.abs(z**2 - 0.6)
+    twice = 0.7 * x1**2 / 2 / distance
     rms_of_x = np.sqrt(mean**2 + twice**2 / 2)
-    assert found.rms(design)[0] == pytest.approx(rms_of_x, rel=1e-9)
-    assert_allclose(found.rms(design, phases=True), found.rms(design), rtol=1e-9)
+    rms = found.rms(design)
+    assert rms[0] == pytest.approx(rms_of_x, rel=1e-9)
+    with_phases = found.rms(design, phases=True)
+    assert_allclose(with_phases, found.rms(design), rtol=1e-9)
     u = design.signals()
     x, z = found.quadratic.second_order(u)[0].T
-    assert_allclose(z, x + u[0, :, 0] ** 2, atol=1e-15)
+    square = u[0, :, 0] ** 2
+    assert_allclose(z, x + square, atol=1e-15)
 
 
 @pytest.mark.slow
@@ -235,14 +258,18 @@ def test_designs_within_a_distortion(hopper_cycle):
         """The distortion of each output as a share of its limit."""
         return {name: rms[f"distortion of {name}"] / LEVEL[name] for name in LEVEL}
 
-    at_limit = [name for name, share in shares(plan.rms).items() if share > 0.99]
+    found = shares(plan.rms).items()
+    at_limit = [name for name, share in found if share > 0.99]
     assert len(at_limit) > 0
     assert plan.limited == tuple(at_limit)
-    assert max(shares(plan.rms).values()) == pytest.approx(1)
-    assert max(shares(plan.usual_rms).values()) == pytest.approx(1)
+    largest = max(shares(plan.rms).values())
+    assert largest == pytest.approx(1)
+    largest_usual = max(shares(plan.usual_rms).values())
+    assert largest_usual == pytest.approx(1)
     assert plan.saved > 1.2
     assert 1 <= plan.certificate < 1.1
-    assert f"With the {' and '.join(plan.limited)} limited, one cycle" in plan.advice
+    names = " and ".join(plan.limited)
+    assert f"With the {names} limited, one cycle" in plan.advice
     assert "of distortion: an upper bound" in repr(plan)
 
     # Twice what is allowed: twice the power, half of the strides.
@@ -254,7 +281,8 @@ def test_designs_within_a_distortion(hopper_cycle):
     # What one draw of the phases does, as the nonlinear hopper does by the test above.
     quadratic = second_order(hopper_cycle, sections, OUTPUTS, ("u",))
     outputs = quadratic.second_order(plan.design.signals())
-    rms = np.sqrt(np.mean(outputs**2, axis=(0, 1)))
+    squares = np.mean(outputs**2, axis=(0, 1))
+    rms = np.sqrt(squares)
     expected = [plan.rms[f"distortion of {name}"] for name in OUTPUTS]
     assert_allclose(rms, expected, rtol=0.1)
 
@@ -267,7 +295,8 @@ def test_beside_other_limits(quadratic):
     options = dict(noise={"x": 1e-4}, goal=GOAL)
     limit = Limits(peak={"u": 0.05}, distortion=distortion)
     peaked = hj.optimal_design(model, usual, limit=limit, **options)
-    assert np.abs(peaked.design.signals()).max() <= 0.05 * (1 + 1e-9)
+    peak = np.abs(peaked.design.signals()).max()
+    assert peak <= 0.05 * (1 + 1e-9)
     assert peaked.rms["distortion of x"] <= 1e-3 * (1 + 1e-9)
     assert peaked.certificate >= 1
     both = hj.optimal_design(
@@ -302,7 +331,8 @@ def test_without_distortion(quadratic):
 
 def test_bad_distortions(quadratic):
     cycle, sections, model = quadratic
-    twice = hj.linear.LDTP(model.A, 2 * model.B, model.C, outputs="x")
+    doubled = 2 * model.B
+    twice = hj.linear.LDTP(model.A, doubled, model.C, outputs="x")
     for family, message in (
         (hj.ClockPhase(8), "different n_sections: 8 and 4"),
         (sections, "differ in H_0 .to x, by 50%"),

@@ -45,12 +45,14 @@ def test_transfer_functions_in_a_band(model, usual):
     assert plan.names == ("H_0 of y", "H_1 of y")
     assert plan.certificate < 1.03
     f = 0.2 + 0.6 * (np.arange(200) + 0.5) / 200
-    power = np.abs(model.htf(f, (0, 1)).H) ** 2
+    H = model.htf(f, (0, 1)).H
+    power = np.abs(H) ** 2
     size = power.mean(axis=1).sum()
 
     def require_variances(design, said):
         fit = hj.fit_ldtp(expected_htf(model, design, NOISE), initial=model)
-        variance = fit.htf(f, (0, 1)).variance[:, :, 0, 0]
+        htf = fit.htf(f, (0, 1))
+        variance = htf.variance[:, :, 0, 0]
         assert_allclose(said, variance.mean(axis=1) / size, rtol=0.02)
 
     require_variances(plan.usual, plan.usual_variances)
@@ -102,8 +104,11 @@ def test_multipliers_keep_the_numbers_of_the_model():
 
 
 def test_bad_goals(model, usual):
-    close = np.array([np.eye(2), [[0.5, 0.01], [0, 0.5 + 1e-9]]])
-    double = hj.linear.LDTP(close, np.ones((2, 2, 1)), np.ones((2, 1, 2)))
+    second = [[0.5, 0.01], [0, 0.5 + 1e-9]]
+    close = np.array([np.eye(2), second])
+    B = np.ones((2, 2, 1))
+    C = np.ones((2, 1, 2))
+    double = hj.linear.LDTP(close, B, C)
     M = hj.designs.MultiplierGoal
     walker = hj.models.SimplestWalker()
     at = hj.AtEvent("heelstrike")
@@ -133,9 +138,25 @@ def with_angle(angle):
             [[1.0, -0.1], [0.0, 1.0]],
         ]
     )
-    B = np.array([[1, 0.2], [0.5, -1], [0.3, 0.1], [1, 1]])
-    C = np.array([[1, 0.4], [0.2, 1], [1, -1], [0.5, 0.5]])
-    return hj.linear.LDTP(A, B[:, :, None], C[:, None])
+    B = np.array(
+        [
+            [1, 0.2],
+            [0.5, -1],
+            [0.3, 0.1],
+            [1, 1],
+        ]
+    )
+    C = np.array(
+        [
+            [1, 0.4],
+            [0.2, 1],
+            [1, -1],
+            [0.5, 0.5],
+        ]
+    )
+    by_input = B[:, :, None]
+    by_state = C[:, None]
+    return hj.linear.LDTP(A, by_input, by_state)
 
 
 def variance(model, design):
@@ -182,7 +203,8 @@ def test_limits_hold_for_each_of_several_models(three):
     rms = []
     for model in three:
         data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
-        rms.append(np.sqrt(np.mean(data.y**2)))
+        square = np.mean(data.y**2)
+        rms.append(np.sqrt(square))
     assert max(rms) == pytest.approx(0.1, rel=1e-2)
 
 
@@ -192,7 +214,8 @@ def test_several_models_that_do_not_fit_together(three):
         hj.errors.DefinitionError, match="model 1 and model 0 have different n_sections"
     ):
         hj.optimal_design([three[0], hj.testing.synthetic_ldtp()], usual)
-    unstable = dataclasses.replace(three[1], A=1.1 * three[1].A)
+    larger = 1.1 * three[1].A
+    unstable = dataclasses.replace(three[1], A=larger)
     with pytest.raises(hj.errors.DefinitionError, match="model 1 is unstable"):
         hj.optimal_design([three[0], unstable], usual)
     with pytest.raises(hj.errors.DefinitionError, match="not an empty list"):
@@ -227,7 +250,8 @@ def test_physical_parameters():
 
     exact = model.htf(usual.frequencies, harmonics)
     H = exact.H[:, :, :1]
-    variance = np.broadcast_to(usual.expected_variance(1e-4)[:, None], H.shape)
+    by_line = usual.expected_variance(1e-4)
+    variance = np.broadcast_to(by_line[:, None], H.shape)
     htf = hj.linear.HTF(
         exact.frequencies, H, harmonics, 8, exact.inputs, "x", variance=variance
     )
@@ -235,5 +259,6 @@ def test_physical_parameters():
     S = hj.fitting.identifiability(
         cycle.system, observed, free, guess=cycle
     ).sensitivity
-    bound = np.sqrt(np.diag(np.linalg.inv(S.T @ S)))
+    covariance = np.linalg.inv(S.T @ S)
+    bound = np.sqrt(np.diag(covariance))
     assert_allclose(plan.usual_standard_errors, bound, rtol=1e-6)

@@ -19,24 +19,30 @@ def test_peaks_hold_in_every_experiment(optimal_two):
     free = optimal_two()
     plan = optimal_two(limit=Limits(rms={"u1": 0.05}, peak={"u0": 0.1}))
     u = plan.design.signals()
-    peaks = np.abs(u).max(axis=1)[:, 0]
+    largest = np.abs(u).max(axis=1)
+    peaks = largest[:, 0]
     assert_allclose(peaks, 0.1)
-    rms = np.sqrt(np.mean(u[..., 1] ** 2))
+    square = u[..., 1] ** 2
+    rms = np.sqrt(np.mean(square))
     assert_allclose(rms, plan.rms["u1"])
     assert plan.limited == ("u1", "peak of u0")
     # (The crest factor is about 2.)
     assert 1.5 < plan.criterion / free.criterion < 5
     assert plan.certificate > 1.5
     # The usual amplitudes get phases for low peaks, too: the design saves strides by its powers.
-    usual_peaks = np.abs(plan.usual.signals()).max(axis=1)[:, 0]
+    usual_size = np.abs(plan.usual.signals())
+    usual_peaks = usual_size.max(axis=1)[:, 0]
     assert set(usual_peaks.round(6)) == {0.0, 0.1}
 
 
 def test_rates(optimal_two):
     """The change from one section to the next, also from the last one to the first."""
     plan = optimal_two(limit=Limits(rms=RMS, rate={"u0": 0.03}))
-    change = np.diff(plan.design.signals(33), axis=1)[:, : 6 * 32]
-    measured = np.sqrt(np.mean(change[..., 0] ** 2))
+    signals = plan.design.signals(33)
+    changes = np.diff(signals, axis=1)
+    change = changes[:, : 6 * 32]
+    square = change[..., 0] ** 2
+    measured = np.sqrt(np.mean(square))
     assert measured == pytest.approx(0.03, rel=1e-3)
     assert plan.certificate < 1.03
     assert "rms of u0 and u1 and rate of u0 limited" in plan.advice
@@ -47,8 +53,11 @@ def test_strides(optimal_two, two_usual):
     plan = optimal_two(limit=Limits(rms="input", cycles=300))
     assert plan.design.experiments == 300 // 32
     assert plan.cycles <= 300
-    power = np.sqrt(np.mean(two_usual.signals() ** 2, axis=(0, 1)))
-    assert all(plan.rms[f"u{i}"] <= power[i] * (1 + 1e-9) for i in (0, 1))
+    squares = two_usual.signals() ** 2
+    power = np.sqrt(np.mean(squares, axis=(0, 1)))
+    for i in (0, 1):
+        allowed = power[i] * (1 + 1e-9)
+        assert plan.rms[f"u{i}"] <= allowed
 
 
 def test_a_peak_that_nothing_exceeds_changes_nothing(optimal_two):
@@ -72,10 +81,12 @@ def test_noise_that_differs_between_harmonics(two, optimal_two):
     htf = two.htf(plan.usual.frequencies, harmonics)
     # Harmonic m of an output is seen at f + m, of which lines between sections are mirrored.
     shifted = htf.frequencies + harmonics[:, None]
-    seen_at = np.abs((shifted + N / 2) % N - N / 2)
+    shift = (shifted + N / 2) % N
+    seen_at = np.abs(shift - N / 2)
     spectra = [level(seen_at) ** 2 for level in noise.values()]
     spectrum = np.stack(spectra, axis=2)[..., None]
-    variance = spectrum * plan.usual.expected_variance()[:, None, :]
+    usual_variance = plan.usual.expected_variance()[:, None, :]
+    variance = spectrum * usual_variance
     uncertain = dataclasses.replace(htf, source="estimate", variance=variance)
     bound = hj.identify.cramer_rao(two, uncertain)
     total = np.trace(bound.multiplier_covariances[0])

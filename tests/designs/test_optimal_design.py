@@ -51,8 +51,10 @@ def test_the_hopper_with_its_input_limited(isochron_ldtp):
     plan = hj.optimal_design(isochron_ldtp)
     assert plan.saved == pytest.approx(19.17, abs=0.3)
     assert 1 <= plan.certificate < 1.03
-    assert plan.rms["yM"] / plan.usual_rms["yM"] == pytest.approx(5.83, abs=0.05)
-    assert plan.frequencies[np.argmax(plan.power)] == pytest.approx(0.3, abs=0.04)
+    gain = plan.rms["yM"] / plan.usual_rms["yM"]
+    assert gain == pytest.approx(5.83, abs=0.05)
+    strongest = plan.frequencies[np.argmax(plan.power)]
+    assert strongest == pytest.approx(0.3, abs=0.04)
     assert (
         f"cycle of this design replaces {plan.saved:.2g} with equal amplitudes."
         in repr(plan)
@@ -68,7 +70,9 @@ def test_the_hopper_with_deviations_limited(isochron_ldtp, usual):
     assert 1 < plan.saved < 1.05
     assert plan.certificate < 1.03
     assert plan.advice.endswith("limited, equal amplitudes are nearly optimal.")
-    assert all(plan.rms[n] <= plan.usual_rms[n] * (1 + 1e-9) for n in ("yM", "vM"))
+    for n in ("yM", "vM"):
+        allowed = plan.usual_rms[n] * (1 + 1e-9)
+        assert plan.rms[n] <= allowed
     both = hj.optimal_design(
         isochron_ldtp, usual, limit={"u": 0.02, "yM": 0.001}, noise=NOISE
     )
@@ -85,10 +89,13 @@ def test_experiments_are_as_promised(plan, isochron_ldtp):
     data = hj.experiments.simulate_experiments(
         isochron_ldtp, plan.design, start="periodic"
     )
-    rms = np.sqrt(np.mean(data.y**2, axis=(0, 1)))
-    assert_allclose(rms, [plan.rms["yM"], plan.rms["vM"]], rtol=1e-3)
+    squares = data.y**2
+    rms = np.sqrt(np.mean(squares, axis=(0, 1)))
+    promised = [plan.rms["yM"], plan.rms["vM"]]
+    assert_allclose(rms, promised, rtol=1e-3)
     assert plan.cycles == plan.usual.cycles(0)
-    assert plan.cycles_for(plan.standard_errors.max() / 2) == 4 * plan.cycles
+    half = plan.standard_errors.max() / 2
+    assert plan.cycles_for(half) == 4 * plan.cycles
 
 
 def test_fits_reach_what_is_promised(model):
@@ -100,11 +107,13 @@ def test_fits_reach_what_is_promised(model):
     data = hj.experiments.simulate_experiments(model, plan.design, start="periodic")
     errors = []
     for seed in range(16):
-        noisy = hj.experiments.add_noise(data, std=list(noise.values()), seed=seed)
+        std = list(noise.values())
+        noisy = hj.experiments.add_noise(data, std=std, seed=seed)
         fit = hj.fit_multipliers(hj.estimate_htf(noisy, HARMONICS), 2)
         errors.append(fit.compare(model.multipliers).error[0])
     rms = np.sqrt(np.mean(np.square(errors)))
-    assert rms == pytest.approx(np.linalg.norm(plan.standard_errors), rel=0.3)
+    expected = np.linalg.norm(plan.standard_errors)
+    assert rms == pytest.approx(expected, rel=0.3)
 
 
 def test_units_and_estimates(isochron_ldtp, usual):

@@ -49,11 +49,13 @@ def test_it_stops_at_the_precision_that_was_asked(studies, model, first):
 
     plan = hj.optimal_design(model, first, noise=NOISE)
     error = end.standard_errors[-1, 0]
-    strides_of_first = plan.usual_criterion * plan.usual.cycles(0) / error**2
+    usual_cycles = plan.usual.cycles(0)
+    strides_of_first = plan.usual_criterion * usual_cycles / error**2
     assert strides_of_first > 4 * end.cycles[-1]
     # The bound of as many strides, all of them with the best design for the true model.
     bound_of_plan = np.linalg.norm(plan.standard_errors)
-    bound = bound_of_plan * np.sqrt(plan.cycles / end.cycles[-1])
+    left = plan.cycles / end.cycles[-1]
+    bound = bound_of_plan * np.sqrt(left)
     assert error > 0.95 * bound
 
 
@@ -65,7 +67,8 @@ def test_every_block_is_counted_and_none_is_changed(studies, model, first):
     cycles = [study.design.cycles(0) for study in studies[:-1]]
     assert_array_equal(studies[-1].cycles, np.cumsum(cycles))
     for before, after in zip(studies[1:], studies[2:], strict=False):
-        assert after.cycles[-1] <= 3 * before.cycles[-1]
+        allowed = 3 * before.cycles[-1]
+        assert after.cycles[-1] <= allowed
     for study in studies[1:]:
         assert study.noise == pytest.approx(NOISE, rel=0.1)
     again = studies[0].add(measured(model, first, seed=1))
@@ -100,7 +103,9 @@ def test_goals(model, first, goal):
     study = study.add(measured(model, first))
     assert study.standard_errors.shape == (1, 1)
     assert study.plan.saved > 3
-    assert study.standard_errors[0, 0] <= study.fit.standard_errors[0] * (1 + 1e-12)
+    found = study.standard_errors[0, 0]
+    by_fit = study.fit.standard_errors[0]
+    assert found <= by_fit * (1 + 1e-12)
 
 
 def test_repeated_windows_count(model, first):
@@ -108,12 +113,16 @@ def test_repeated_windows_count(model, first):
     long = hj.experiments.simulate_experiments(
         model, first, discard=32, start="periodic"
     )
-    noisy = hj.experiments.add_noise(long, std=list(NOISE.values()), seed=1)
+    std = list(NOISE.values())
+    noisy = hj.experiments.add_noise(long, std=std, seed=1)
     study = hj.designs.SequentialDesign(first, 2, 1e-5)
     once = study.add(noisy)
     twice = study.add(noisy, repeats=2)
-    assert once.cycles[0] == twice.cycles[0] == 2 * first.cycles(0)
-    assert once.noise["x"] == pytest.approx(twice.noise["x"], rel=0.1)
+    both = 2 * first.cycles(0)
+    assert once.cycles[0] == twice.cycles[0] == both
+    of_once = once.noise["x"]
+    of_twice = twice.noise["x"]
+    assert of_once == pytest.approx(of_twice, rel=0.1)
     assert twice.plan.criterion == pytest.approx(once.plan.criterion, rel=0.2)
 
 
@@ -175,15 +184,18 @@ def test_few_degrees_of_freedom_are_paid_for(model, first, monkeypatch):
     """Where Student's intervals are half as wide again, a study is not done at the standard error
     that was asked, and the next block is longer by 1.5 squared, or as long as it may be."""
     data = measured(model, first)
-    error = hj.designs.SequentialDesign(first, 2, 1.0).add(data).standard_errors[0, 0]
+    study = hj.designs.SequentialDesign(first, 2, 1.0).add(data)
+    error = study.standard_errors[0, 0]
     # The scatter of few lines understates the error of a first block, but the noise level does not.
     plan = hj.optimal_design(model, first, noise=NOISE)
     assert error > 0.95 * np.linalg.norm(plan.usual_standard_errors)
     asked = 1.2 * error
     assert hj.designs.SequentialDesign(first, 2, asked).add(data).done
-    half = hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data)
+    study_of_half = hj.designs.SequentialDesign(first, 2, 0.4 * error)
+    half = study_of_half.add(data)
     monkeypatch.setattr("hybridjax.designs.study._student", lambda fit: 1.5)
-    assert not hj.designs.SequentialDesign(first, 2, asked).add(data).done
+    study_asked = hj.designs.SequentialDesign(first, 2, asked)
+    assert not study_asked.add(data).done
     assert (
         hj.designs.SequentialDesign(first, 2, 0.4 * error).add(data).plan.cycles
         > half.plan.cycles
@@ -205,10 +217,13 @@ def test_an_unstable_estimate_repeats_the_first_design(model, first):
 
 def records(size, noise=0.0, *, before=5, repeats=1, seed=0):
     """Return two outputs of rms one, the second with a transient, larger in the first cycle."""
-    cycle = np.repeat(np.arange(before + P * repeats), N)
+    cycles = np.arange(before + P * repeats)
+    cycle = np.repeat(cycles, N)
     n = np.arange(len(cycle))
-    wave = np.sqrt(2) * np.cos(2 * np.pi * n / (N * P))
-    transient = size * (0.8**cycle + 3 * (cycle == 0))
+    angle = 2 * np.pi * n / (N * P)
+    wave = np.sqrt(2) * np.cos(angle)
+    start = 3 * (cycle == 0)
+    transient = size * (0.8**cycle + start)
     y = np.stack([wave, wave + transient], axis=1)
     rng = np.random.default_rng(seed)
     y = y + noise * rng.normal(size=(S, *y.shape))
@@ -241,7 +256,10 @@ def test_noise_is_no_transient():
     difference of two cycles contains twice."""
     noise = np.array([0.01, 0.01])
     level = 2 * 0.01**2
-    size = np.sqrt(6 * level * np.sqrt(2 / (N * S))) / (0.8 * (1 - 0.8**P))
+    spread = np.sqrt(2 / (N * S))
+    power = 6 * level * spread
+    response = 0.8 * (1 - 0.8**P)
+    size = np.sqrt(power) / response
     for seed in range(20):
         refuse_transient(records(0.0, 0.01, seed=seed), 1, MULTIPLIERS, noise, 0.0)
         with pytest.raises(hj.errors.DefinitionError, match="transient is left"):

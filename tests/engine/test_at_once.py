@@ -57,7 +57,9 @@ class Converter(hj.HybridSystem):
 
 def at_tick(duty):
     """x on the limit cycle where a period begins, in closed form."""
-    return (np.exp(duty - 1) - np.exp(-1)) / (1 - np.exp(-1))
+    empty = np.exp(-1)
+    rise = np.exp(duty - 1) - empty
+    return rise / (1 - np.exp(-1))
 
 
 @pytest.mark.parametrize("duty, by_ramp", CASES)
@@ -65,7 +67,8 @@ def test_a_converter_at_any_duty(duty, by_ramp):
     """Ten periods from rest approach the cycle by a factor of e each, and start where it is on."""
     system = Converter(duty, by_ramp)
     path = hj.simulate(system, "off", (0.0, 0.5), 10.5, time=0.5)
-    exact = at_tick(duty) * (1 - np.exp(-10.0))
+    charging = 1 - np.exp(-10.0)
+    exact = at_tick(duty) * charging
     assert_allclose(path.after[-1, 0], exact, atol=1e-9)
 
 
@@ -74,7 +77,8 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
     """A comparator that trips within rounding of the tick is refused by name."""
     system = Converter(duty, by_ramp)
     chart = "off" if duty <= 0.5 else "on"
-    guess = hj.Guess(chart, (0.3, 0.9), time=0.6 if duty == 0.5 else 0.9)
+    late = 0.6 if duty == 0.5 else 0.9
+    guess = hj.Guess(chart, (0.3, 0.9), time=late)
     if by_ramp and duty > 1 - 1e-8:
         with pytest.raises(
             hj.errors.ComputationError, match="'trip' and 'tick' coincide"
@@ -86,7 +90,8 @@ def test_the_cycle_of_a_converter_at_any_duty(duty, by_ramp):
 
     def charged(time):
         """x on the cycle while on."""
-        return 1 + (at_tick(duty) - 1) * np.exp(-time)
+        above = at_tick(duty) - 1
+        return 1 + above * np.exp(-time)
 
     if chart == "on":
         exact = charged(time)
@@ -116,18 +121,23 @@ def test_full_duty_is_refused_by_name_from_any_guess(
 
 
 def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
-    cycle = hj.find_limit_cycle(Converter(1.05), hj.Guess("on", (0.3, 0.2), time=0.9))
+    guess = hj.Guess("on", (0.3, 0.2), time=0.9)
+    cycle = hj.find_limit_cycle(Converter(1.05), guess)
     failed = hj.find_limit_cycle(Converter(1.0), cycle, throw=False)
     (group,) = failed.simultaneous_events()
     assert set(group.orders) == {("tick on",), ("trip", "tick")}
     duties = np.array([0.95, *BESIDE_FULL, 1.1])
-    batch = hj.orbits.find_limit_cycles([Converter(float(x)) for x in duties], cycle)
-    assert_array_equal(batch.ok, [True, *[False] * len(BESIDE_FULL), True])
+    converters = [Converter(float(x)) for x in duties]
+    batch = hj.orbits.find_limit_cycles(converters, cycle)
+    beside = [False] * len(BESIDE_FULL)
+    assert_array_equal(batch.ok, [True, *beside, True])
     result = jax.jit(
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
-    is_found = result(jnp.asarray(duties)) == hj.errors.Result.OK
-    assert_array_equal(is_found, [*[False] * len(BESIDE_FULL), False, True])
+    codes = result(jnp.asarray(duties))
+    is_found = codes == hj.errors.Result.OK
+    not_found = [False] * len(BESIDE_FULL)
+    assert_array_equal(is_found, [*not_found, False, True])
 
 
 def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_before():
@@ -141,8 +151,10 @@ def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_befor
         return near.anchor.q[0, 0], near.result
 
     state, result = found(0.93)
-    exact = 1 + (at_tick(0.93) - 1) * np.exp(-0.9)
-    assert result != hj.errors.Result.OK or state == pytest.approx(exact, abs=1e-10)
+    above = at_tick(0.93) - 1
+    exact = 1 + above * np.exp(-0.9)
+    is_near = state == pytest.approx(exact, abs=1e-10)
+    assert result != hj.errors.Result.OK or is_near
 
 
 def test_schedules_whose_order_is_not_defined():
@@ -192,7 +204,8 @@ def test_a_current_above_its_limit_at_the_tick(allows, events):
     """The comparator trips at once, or the tick is not enabled: the current decays either way."""
     path = hj.simulate(PeakCurrent(allows=allows), "off", (2.0,), 5.0, time=0.5)
     assert [e.name for e in path.events] == events
-    assert_allclose(path.after[-1], [2.0 * np.exp(-0.5)], rtol=1e-9)
+    expected = 2.0 * np.exp(-0.5)
+    assert_allclose(path.after[-1], [expected], rtol=1e-9)
 
 
 def neurons(push):
@@ -280,9 +293,12 @@ class Kicked(hj.HybridSystem):
 def test_derivatives_across_an_event_at_once():
     """Of the map x -> (1 + x exp(-rate))^2 0.4 between kicks, and of its fixed point."""
     system = Kicked()
-    cycle = hj.find_limit_cycle(system, hj.Guess("calm", (0.5,), time=0.5))
-    low = np.exp(-0.5 * 0.7) * float(cycle.anchor.q[0, 0])
-    expected = np.exp(-0.5 * 0.7) * 0.4 * (1 + low) ** 2
+    calm = hj.Guess("calm", (0.5,), time=0.5)
+    cycle = hj.find_limit_cycle(system, calm)
+    start = float(cycle.anchor.q[0, 0])
+    low = np.exp(-0.5 * 0.7) * start
+    low_after = np.exp(-0.5 * 0.7) * 0.4
+    expected = low_after * (1 + low) ** 2
     assert_allclose(cycle.state["x"], expected, rtol=1e-11)
     multiplier = 0.8 * (1 + low) * np.exp(-0.7)
     assert_allclose(cycle.multipliers, [multiplier], rtol=1e-9)
@@ -290,11 +306,16 @@ def test_derivatives_across_an_event_at_once():
     assert_allclose(ldtp.multipliers, [multiplier], rtol=1e-9)
 
     def at(rate):
-        return hj.find_limit_cycle(Kicked(rate), cycle).anchor.q[0, 0]
+        kicked = hj.find_limit_cycle(Kicked(rate), cycle)
+        return kicked.anchor.q[0, 0]
 
-    by_steps = (float(at(0.7 + 1e-5)) - float(at(0.7 - 1e-5))) / 2e-5
-    assert_allclose(jax.grad(at)(jnp.asarray(0.7)), by_steps, rtol=1e-7)
-    measured = jax.jit(jax.grad(at))(jnp.asarray(0.7))
+    later = float(at(0.7 + 1e-5))
+    earlier = float(at(0.7 - 1e-5))
+    by_steps = (later - earlier) / 2e-5
+    slope = jax.grad(at)(jnp.asarray(0.7))
+    assert_allclose(slope, by_steps, rtol=1e-7)
+    program = jax.jit(jax.grad(at))
+    measured = program(jnp.asarray(0.7))
     assert_allclose(measured, by_steps, rtol=1e-7)
 
 
@@ -347,7 +368,8 @@ def test_a_guard_that_both_charts_have_happens_once():
         period=2.0,
     )
     path = hj.simulate(system, "day", (-0.5,), 3.3)
-    assert [e.name for e in path.events] == ["by day", "dusk", "dawn", "dusk"]
+    names = [e.name for e in path.events]
+    assert names == ["by day", "dusk", "dawn", "dusk"]
 
 
 def test_a_turn_cannot_begin_between_events_at_once():
@@ -363,11 +385,13 @@ def test_a_turn_cannot_begin_between_events_at_once():
 
 def test_programs_refuse_events_that_coincide():
     """Close to full duty, where the comparator trips right before the tick."""
-    cycle = hj.find_limit_cycle(Converter(0.95), hj.Guess("on", (0.9, 0.9), time=0.9))
+    guess = hj.Guess("on", (0.9, 0.9), time=0.9)
+    cycle = hj.find_limit_cycle(Converter(0.95), guess)
     result = jax.jit(
         jax.vmap(lambda x: hj.find_limit_cycle(Converter(x), cycle).result)
     )
-    measured = result(jnp.array([0.95, 0.99, 1 - 1e-10]))
+    values = jnp.array([0.95, 0.99, 1 - 1e-10])
+    measured = result(values)
     assert_array_equal(
         measured,
         [hj.errors.Result.OK, hj.errors.Result.OK, hj.errors.Result.SIMULTANEOUS],
@@ -432,7 +456,8 @@ def test_an_event_at_once_that_begins_beside_the_known_cycle_is_not_missed():
             hj.find_limit_cycle(Beat(0.8), cycle)
     jumps = np.linspace(0.5, 0.9, 9)
     exists = jumps < LIMIT
-    found = hj.orbits.find_limit_cycles([Beat(float(x)) for x in jumps], cycle)
+    beats = [Beat(float(x)) for x in jumps]
+    found = hj.orbits.find_limit_cycles(beats, cycle)
     assert_array_equal(found.ok, exists)
     assert_array_equal(np.isnan(found.period), ~exists)
     swept = hj.sweep(Beat(), {"jump": jumps.tolist()}, guess=cycle)
@@ -441,7 +466,9 @@ def test_an_event_at_once_that_begins_beside_the_known_cycle_is_not_missed():
     assert_allclose(branch.values.max(), LIMIT, rtol=1e-3)
     assert "'set back' begins to happen at once after 'kick'" in str(branch)
     result = jax.jit(jax.vmap(lambda x: hj.find_limit_cycle(Beat(x), cycle).result))
-    assert_array_equal(result(jnp.asarray(jumps)) == hj.errors.Result.OK, exists)
+    codes = result(jnp.asarray(jumps))
+    is_found = codes == hj.errors.Result.OK
+    assert_array_equal(is_found, exists)
 
 
 @pytest.mark.parametrize("with_another_section", [False, True])
@@ -461,22 +488,27 @@ def test_experiments_do_not_miss_an_event_at_once_on_a_section(with_another_sect
     decay = np.exp(-0.7)
     off = pushes[0] / 0.7 * (1 - decay)
     after = data.y[0, 20 * N :: N, 0]
-    assert_allclose(after[:3], [0.0, off, off * decay], atol=1e-8)
+    expected = [0.0, off, off * decay]
+    assert_allclose(after[:3], expected, atol=1e-8)
     response = hj.experiments.response_function(cycle, sections, ["x"])
     order = hj.errors.Result.EVENT_ORDER
-    assert_array_equal(response(u[:, 18 * N :]).result, [0, order])
-    other = response(np.zeros((1, 4 * N, 1)), system=Beat(0.8))
+    found = response(u[:, 18 * N :])
+    assert_array_equal(found.result, [0, order])
+    none = np.zeros((1, 4 * N, 1))
+    other = response(none, system=Beat(0.8))
     assert_array_equal(other.result, [order])
     returns = hj.sections.section_map(cycle, sections, 0, 0)
     begin = np.asarray(returns.fixed_point)
-    assert_allclose(returns(begin, u=pushes[:1]).q[0], begin[0] + off, atol=1e-9)
+    end = returns(begin, u=pushes[:1]).q[0]
+    assert_allclose(end, begin[0] + off, atol=1e-9)
     for start, push in ((begin, 0.3), (np.array([1.3, 0.0]), 0.0)):
         with pytest.raises(hj.errors.ComputationError, match="events came in another"):
             returns(start, u=np.array([push]))
 
 
 def test_a_section_at_an_event_that_another_one_follows_at_once_is_refused():
-    cycle = hj.find_limit_cycle(Kicked(), hj.Guess("calm", (0.5,), time=0.5))
+    guess = hj.Guess("calm", (0.5,), time=0.5)
+    cycle = hj.find_limit_cycle(Kicked(), guess)
     for call in (hj.linearize, hj.experiments.response_function):
         with pytest.raises(
             hj.errors.ComputationError,

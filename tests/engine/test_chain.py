@@ -24,14 +24,18 @@ STEP = 1e-6
 
 def flow(s, t, q, u, end):
     """(t, q) at the end, the lanes at the start, the target and the tape."""
-    lanes = start_lanes(s, np.array([t]), np.zeros(1, np.int32), q[:, None])
+    charts = np.zeros(1, np.int32)
+    times = np.array([t])
+    lanes = start_lanes(s, times, charts, q[:, None])
     target = until(np.array([end]))
     sizes = np.ones((len(s.charts), s.d))
     settings = Settings(1e-12, 1e-12, 2000, sizes)
     options = Options(True, tangents=True)
-    done = move(s, lanes, u[:, None], target, settings, options=options)
+    inputs = u[:, None]
+    done = move(s, lanes, inputs, target, settings, options=options)
     moved = done.moved.lanes
-    after = np.concatenate([moved.t, moved.q[:, 0]])
+    state = moved.q[:, 0]
+    after = np.concatenate([moved.t, state])
     return after, lanes, target, done
 
 
@@ -45,22 +49,27 @@ def test_jacobians_are_the_slopes_of_the_flow(name):
     """By the time, the state and the input at the start, through events and schedules; charts'
     fields and guards depend on time, and resets on the input."""
     sample = jax.tree_util.tree_map(np.asarray, draw(name, 1))
-    system = Random(STRUCTURES[name][0], sample.charts, sample.arrows)
+    plan = STRUCTURES[name][0]
+    system = Random(plan, sample.charts, sample.arrows)
     s = Structure(from_host(system))
     # x holds the time, the states (padded) and the inputs at the start.
     x = np.zeros(1 + s.d + s.nu)
     x[0] = sample.start.t
-    x[1 : 1 + len(sample.start.q)] = sample.start.q
+    used = slice(1, 1 + len(sample.start.q))
+    x[used] = sample.start.q
     end = sample.start.t + 3.0
 
     def run(x):
-        return flow(s, x[0], x[1 : 1 + s.d], x[1 + s.d :], end)
+        q = x[1 : 1 + s.d]
+        u = x[1 + s.d :]
+        return flow(s, x[0], q, u, end)
 
     states = range(1, 1 + s.dims[0])
     inputs = range(1 + s.d, len(x))
     with unchecked_host():
         _, lanes, target, done = run(x)
-        jacobian = chain(s, lanes, target, done.tape, of_states=False)[0][0]
+        found = chain(s, lanes, target, done.tape, of_states=False)
+        jacobian = found[0][0]
         events = events_of(done)
         assert len(events) > 0
         for k in (0, *states, *inputs):

@@ -45,14 +45,16 @@ def test_harmonic_transfer_functions_compile_nothing():
     ports = {"inputs": ("a", "b"), "outputs": ("a", "b")}
     f = np.arange((SECTIONS + 1) // 2)
     rng = np.random.default_rng(0)
-    A, B, C, D = 0.1 * rng.normal(size=(4, SECTIONS, 2, 2))
+    blocks = rng.normal(size=(4, SECTIONS, 2, 2))
+    A, B, C, D = 0.1 * blocks
     model = hj.linear.LDTP(A, B, C, D, **ports)
     with compiled() as names:
         exact = model.htf(f)
         loop = model.feedback(np.eye(2)).inverse()
         size = np.ones(exact.H.shape)
         more = {"n_sections": SECTIONS, **ports}
-        variance_dof = hj.linear.VarianceDof(np.full(len(f), 4.0), size)
+        dof = np.full(len(f), 4.0)
+        variance_dof = hj.linear.VarianceDof(dof, size)
         htf = hj.linear.HTF(
             f,
             exact.H,
@@ -61,6 +63,7 @@ def test_harmonic_transfer_functions_compile_nothing():
             variance=size,
             variance_dof=variance_dof,
         )
-        print(htf @ exact, htf.feedback(exact).inverse(), (htf + exact)[0], loop)
+        loop_inverse = htf.feedback(exact).inverse()
+        print(htf @ exact, loop_inverse, (htf + exact)[0], loop)
         print(htf.error(exact), htf.select(1).confidence_radius())
     assert names <= {"_constant", "stage"}

@@ -23,12 +23,15 @@ def crossing(v0, v1, d0, d1, armed=True):
 def cubic(v0, v1, d0, d1):
     """Its coefficients, the highest first."""
     rise = v1 - v0
-    return np.array([d0 + d1 - 2 * rise, 3 * rise - 2 * d0 - d1, d0, v0])
+    third = d0 + d1 - 2 * rise
+    second = 3 * rise - 2 * d0 - d1
+    return np.array([third, second, d0, v0])
 
 
 def real_roots(coefficients):
     roots = np.roots(np.trim_zeros(coefficients, "f"))
-    return np.sort(roots[np.abs(roots.imag) < 1e-9].real)
+    is_real = np.abs(roots.imag) < 1e-9
+    return np.sort(roots[is_real].real)
 
 
 def first_fall(coefficients, armed):
@@ -45,14 +48,20 @@ def first_fall(coefficients, armed):
     if not falls:
         return np.inf
     # The guard must have been positive before: at once if it is armed, else after a rise.
-    was_positive = armed or coefficients[-1] > 0 or any(r < falls[0] for r in rises)
+    rose = any(r < falls[0] for r in rises)
+    was_positive = armed or coefficients[-1] > 0 or rose
     if was_positive:
         return falls[0]
     return falls[1] if len(falls) > 1 else np.inf
 
 
 @settings(max_examples=200)
-@given(v0=number, v1=number, d0=number, d1=number)
+@given(
+    v0=number,
+    v1=number,
+    d0=number,
+    d1=number,
+)
 def test_first_crossing_is_a_root(v0, v1, d0, d1):
     armed = v0 > 0
     assume(abs(v0) > 1e-2 and abs(v1) > 1e-2)
@@ -106,6 +115,7 @@ def test_halfway_a_cubic_is_met_exactly():
     ends = np.array([0.0, length])
     values = np.polyval(coefficients, ends)
     rates = np.polyval(slopes, ends)
-    state, rate = halfway_cubic(*values, *rates, np.array(length))
+    times = np.array(length)
+    state, rate = halfway_cubic(*values, *rates, times)
     assert_allclose(state, np.polyval(coefficients, length / 2), rtol=1e-14)
     assert_allclose(rate, np.polyval(slopes, length / 2), rtol=1e-13)

@@ -65,7 +65,8 @@ def agree(system, chart, state, u, begin, duration):
     t = np.array([begin], float)
     inputs = np.reshape(u, (s.nu, 1))
     settings = Settings(1e-9, 1e-9, max_steps=400)
-    arguments = (t, np.array([chart], np.int32), q, inputs, t + duration, settings)
+    charts = np.array([chart], np.int32)
+    arguments = (t, charts, q, inputs, t + duration, settings)
     with unchecked_host():
         host = flow(system, *to_host(arguments))
         whole = flow(system, *to_host(arguments), at_once=True)
@@ -85,8 +86,10 @@ def agree(system, chart, state, u, begin, duration):
         assert_allclose(ours.t, theirs.t, rtol=1e-12)
         assert_allclose(ours.q / size, theirs.q / size, atol=1e-9)
     moved = host.tape.code[:, 0] != IDLE
-    assert_allclose(whole.tape.t[moved], host.tape.t[moved], rtol=1e-9)
-    assert_allclose(whole.tape.before[moved], host.tape.before[moved], atol=1e-7)
+    found_times = whole.tape.t[moved]
+    assert_allclose(found_times, host.tape.t[moved], rtol=1e-9)
+    found_states = whole.tape.before[moved]
+    assert_allclose(found_states, host.tape.before[moved], atol=1e-7)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, FEW))
@@ -128,7 +131,8 @@ def wrong_moves(map, expected):
     gap = 1e-6 * third * map.scale[expected.chart].T
     yield expected._replace(q=expected.q + gap)
     is_first = expected.order + expected.lane == 0
-    yield expected._replace(t=expected.t - 1e-6 * map.expected * is_first)
+    sooner = 1e-6 * map.expected * is_first
+    yield expected._replace(t=expected.t - sooner)
     is_event = expected.code >= 0
     if is_event[:-1].any():
         is_first_event = is_event & (np.cumsum(is_event) == 1)
@@ -168,7 +172,8 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     s = map.structure
     sources = [s.chart_index(transition.source) for transition in s.transitions]
     for pieces in (again.pieces, turn.pieces):
-        of_other_charts = np.array(sources, int)[:, None] != pieces.chart
+        source_column = np.array(sources, int)[:, None]
+        of_other_charts = source_column != pieces.chart
         pieces.armed[of_other_charts] = False
     assert_array_equal(again.pieces.armed, turn.pieces.armed)
     assert_array_equal(again.pieces.chart, turn.pieces.chart)
@@ -176,10 +181,14 @@ def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     # (Gaps between moves may be as large as the errors of 300 steps, each of 1e-12, which add up; a
     # neuron jumps by 100 sizes of its states in a unit of time.)
     scale = map.scale[turn.pieces.chart].T
-    assert_allclose(again.pieces.q / scale, turn.pieces.q / scale, rtol=0, atol=1e-8)
+    found = again.pieces.q / scale
+    usual = turn.pieces.q / scale
+    assert_allclose(found, usual, rtol=0, atol=1e-8)
     assert_allclose(again.period, turn.period, rtol=3e-10)
     size = np.abs(turn.factors).max(axis=0)
-    assert_allclose(again.factors / size, turn.factors / size, rtol=0, atol=1e-6)
+    factors = again.factors / size
+    usual_factors = turn.factors / size
+    assert_allclose(factors, usual_factors, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("PaddleJuggler",)))
@@ -191,7 +200,10 @@ def test_searches_with_moves_side_by_side_end_at_the_same_cycle(name, monkeypatc
     rng = np.random.default_rng(5)
 
     def move(x):
-        return x * (1 + 0.01 * rng.uniform(-1, 1)) if eqx.is_inexact_array(x) else x
+        if not eqx.is_inexact_array(x):
+            return x
+        change = 0.01 * rng.uniform(-1, 1)
+        return x * (1 + change)
 
     guess = hj.find_limit_cycle(system)
     moved = jax.tree_util.tree_map(move, system)
@@ -214,7 +226,8 @@ def test_a_function_of_the_host_is_compiled_once_it_is_worth_it(monkeypatch):
 
     call = compilation.host_first(function)
     monkeypatch.setattr(compilation, "WORTH_COMPILING", 1e-9)
-    results = [call(from_host(np.arange(3.0))) for _ in range(3)]
+    numbers = np.arange(3.0)
+    results = [call(from_host(numbers)) for _ in range(3)]
     assert seen == [True, False]  # on the host, then traced, then no more
     assert_array_equal(results, [[0.0, 2.0, 4.0]] * 3)
     with jax.default_matmul_precision("highest"):
@@ -233,7 +246,8 @@ def test_gaps_between_moves_end_no_search_for_an_unstable_cycle():
             {"x": Field(("x",), rates)},
             period=2 * np.pi,
         )
-        map = to_host(hj.find_limit_cycle(grow, hj.Guess("x", (0.4,))).return_map)
+        unstable = hj.find_limit_cycle(grow, hj.Guess("x", (0.4,)))
+        map = to_host(unstable.return_map)
         q = map.anchor.q[:, 0]
         turn = map.turn_with_jacobian(q)
         recorded = (turn.pieces, side_by_side(turn.tapes))

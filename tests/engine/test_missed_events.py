@@ -57,8 +57,10 @@ def draw(rng, tolerance):
     turns = np.sort(p.deriv().roots.real)
     turns = turns[(turns > 0) & (turns < 1)]
     ends = np.concatenate([[0.0], turns, [1.0]])
-    p = p * rng.choice([-1, 1]) / np.abs(p(ends)).max()
-    near = max(tolerance, 1e-10) * 10 ** rng.uniform(1, 4) * rng.choice([-1, 1])
+    largest = np.abs(p(ends)).max()
+    p = p * rng.choice([-1, 1]) / largest
+    factor = 10 ** rng.uniform(1, 4)
+    near = max(tolerance, 1e-10) * factor * rng.choice([-1, 1])
     return p - p(rng.choice(turns)) + near, ends
 
 
@@ -66,7 +68,8 @@ def falls(p, ends):
     """The zeros through which p falls, and how far it goes above and below them."""
     for left, right in zip(ends[:-1], ends[1:], strict=True):
         if p(left) > 0 > p(right):
-            yield brentq(p, left, right, xtol=1e-15), min(p(left), -p(right))
+            root = brentq(p, left, right, xtol=1e-15)
+            yield root, min(p(left), -p(right))
 
 
 def test_no_event_of_200_polynomials_is_missed_or_invented():
@@ -75,8 +78,11 @@ def test_no_event_of_200_polynomials_is_missed_or_invented():
     tolerance = np.tile([1e-3, 1e-6, 1e-9, 1e-12], L // 4)
     flows = [draw(rng, x) for x in tolerance]
     s = Structure(chain())
-    q = np.stack([start(p) for p, _ in flows], axis=1)
-    lanes = start_lanes(s, jnp.zeros(L), jnp.zeros(L, jnp.int32), jnp.asarray(q))
+    starts = [start(p) for p, _ in flows]
+    q = np.stack(starts, axis=1)
+    zeros = jnp.zeros(L, jnp.int32)
+    states = jnp.asarray(q)
+    lanes = start_lanes(s, jnp.zeros(L), zeros, states)
     # Each polynomial has a tolerance of its own.
     settings = eqx.tree_at(
         lambda settings: (settings.rtol, settings.atol),
@@ -92,8 +98,10 @@ def test_no_event_of_200_polynomials_is_missed_or_invented():
 
     compared = 0
     for k, (p, ends) in enumerate(flows):
-        is_event = np.asarray(tape.code[:, k]) == 0
-        found = np.asarray(tape.t[:, k])[is_event]
+        code = np.asarray(tape.code[:, k])
+        is_event = code == 0
+        times = np.asarray(tape.t[:, k])
+        found = times[is_event]
         truth = list(falls(p, ends))
         # Events within the tolerance of none may be missed.
         sure = [x for x, height in truth if height >= 10 * tolerance[k]]
@@ -112,11 +120,13 @@ def times(trajectory):
 @pytest.mark.parametrize("depth", [1e-3, 1e-9])
 def test_two_dips_within_a_step(depth):
     """Chebyshev's polynomial of degree 4 touches -1 twice: shifted, it dips below zero twice."""
-    chebyshev = np.polynomial.Chebyshev([1 - depth, 0, 0, 0, 1], domain=[0, 1])
+    coefficients = [1 - depth, 0, 0, 0, 1]
+    chebyshev = np.polynomial.Chebyshev(coefficients, domain=[0, 1])
     powers = chebyshev.convert(kind=np.polynomial.Polynomial)
     p = np.poly1d(powers.coef[::-1])
     extrema = np.sort(p.deriv().roots)
-    first, second = [time for time, _ in falls(p, [0.0, *extrema, 1.0])]
+    ends = [0.0, *extrema, 1.0]
+    first, second = [time for time, _ in falls(p, ends)]
 
     found = hj.simulate(chain(), "a", start(p), 1.0)
     assert_allclose(times(found), [first, second], atol=1e-7)
@@ -134,18 +144,22 @@ def test_a_guard_that_is_faster_than_the_state():
     """Steps are long where the state is linear in time, but the guard turns 80 times."""
 
     def guard(t, q, u):
-        return jnp.sin(500 * t) + 0.3 + 0 * q[0]
+        wave = jnp.sin(500 * t) + 0.3
+        return wave + 0 * q[0]
 
     fall = hj.Transition("fall", "a", "a", guard)
 
     def rates(t, q, u):
         return (1.0,)
 
-    system = toy({"a": Field(("x",), rates)}, (fall,))
+    chart = Field(("x",), rates)
+    system = toy({"a": chart}, (fall,))
     found = hj.simulate(
         system, "a", (0.0,), 1.0, settings=hj.orbits.Settings(1e-6, 1e-6)
     )
-    truth = (np.pi + np.arcsin(0.3) + 2 * np.pi * np.arange(80)) / 500
+    turns = 2 * np.pi * np.arange(80)
+    first = np.pi + np.arcsin(0.3)
+    truth = (first + turns) / 500
     truth = truth[truth < 1]
     assert_allclose([e.time for e in found.events], truth, atol=1e-9)
 
@@ -175,18 +189,25 @@ def test_the_state_halfway_has_its_order(method, order):
 
     begin = 0.8
     lengths = np.array([0.4, 0.2])
-    end = step(np.zeros(2), np.full((1, 2), begin), lengths)
-    state = begin / (1 - begin * np.sin(lengths / 2))
+    start = np.full((1, 2), begin)
+    end = step(np.zeros(2), start, lengths)
+    wave = begin * np.sin(lengths / 2)
+    state = begin / (1 - wave)
     rate = state**2 * np.cos(lengths / 2)
-    state_error = np.abs(np.asarray(end.middle)[0] - state)
-    rate_error = np.abs(np.asarray(end.rate)[0] - rate)
+    found_state = np.asarray(end.middle)[0]
+    state_error = np.abs(found_state - state)
+    found_rate = np.asarray(end.rate)[0]
+    rate_error = np.abs(found_rate - rate)
     # The default method misses the conditions of order 5 by a little: order 4 in the end.
     least = order - 1 if method is VERNER76 else order
-    assert state_error[0] / state_error[1] > 2 ** (least + 0.5)
-    assert rate_error[0] / rate_error[1] > 2 ** (least - 0.5)
+    state_ratio = state_error[0] / state_error[1]
+    assert state_ratio > 2 ** (least + 0.5)
+    rate_ratio = rate_error[0] / rate_error[1]
+    assert rate_ratio > 2 ** (least - 0.5)
     if order > 3:
         cubic, _ = halfway_cubic(begin, end.q, end.f0, end.f1, lengths)
-        cubic_error = np.abs(cubic[0, 0] - state[0])
+        found_cubic = cubic[0, 0]
+        cubic_error = np.abs(found_cubic - state[0])
         assert state_error[0] < 0.2 * cubic_error
 
 
@@ -199,7 +220,9 @@ def test_a_margin_that_allows_a_dip_is_no_clearance():
     assert high[0] > 2.2
     armed = np.array([True])
     assert first_crossing(*ends, armed, margin).near[0]
-    assert not first_crossing(*ends, armed, np.array([0.9])).near[0]
+    above = np.array([0.9])
+    crossing = first_crossing(*ends, armed, above)
+    assert not crossing.near[0]
 
 
 @pytest.mark.parametrize("begin", [0.0, 10.0])
@@ -222,4 +245,5 @@ def test_an_event_just_before_a_blow_up_is_found(begin):
     system = toy({"a": square}, [reset])
     path = hj.simulate(system, "a", (1.0,), 9.5, time=begin)
     spikes = np.array([event.time for event in path.events]) - begin
-    assert_allclose(spikes, np.arange(1, 10) * (1 - 1e-11), rtol=1e-9)
+    expected = np.arange(1, 10) * (1 - 1e-11)
+    assert_allclose(spikes, expected, rtol=1e-9)

@@ -18,32 +18,43 @@ from ..toys import Field, Toys
 
 def tight(s):
     """Settings for states of size 1."""
-    return Settings(1e-13, 1e-13, 256, np.ones((len(s.charts), s.d)))
+    scale = np.ones((len(s.charts), s.d))
+    return Settings(1e-13, 1e-13, 256, scale)
 
 
 def flow(system, chart, q, u, t, end):
     """State after the flow of one lane from time t to `end`, and its result."""
     s = Structure(system)
-    q = jnp.zeros((s.d, 1)).at[: q.shape[0], 0].set(q)
+    padded = jnp.zeros((s.d, 1))
+    rows = q.shape[0]
+    q = padded.at[:rows, 0].set(q)
     index = jnp.full(1, s.chart_index(chart), jnp.int32)
     lanes = start_lanes(s, t[None], index, q)
-    moved = move(s, lanes, u[:, None], until(end[None]), tight(s)).moved
+    target = until(end[None])
+    inputs = u[:, None]
+    moved = move(s, lanes, inputs, target, tight(s)).moved
     return moved.lanes.q[:, 0], moved.result[0]
 
 
 def ball(x):
     """(y, v) of a bouncing ball; x = (y0, v0, gravity, restitution, input, duration)."""
     system = hj.models.BouncingBall(g=x[2], restitution=x[3])
-    return flow(system, "fall", x[:2], x[4:5], jnp.zeros(()), x[5])[0]
+    zero = jnp.zeros(())
+    end = flow(system, "fall", x[:2], x[4:5], zero, x[5])
+    return end[0]
 
 
 def ball_exact(x):
     y0, v0, g, e, u, end = x
     g = g - u
-    speed = jnp.sqrt(v0**2 + 2 * g * y0)
+    square = v0**2 + 2 * g * y0
+    speed = jnp.sqrt(square)
     first = (v0 + speed) / g
     rest = end - first
-    return jnp.stack([e * speed * rest - g * rest**2 / 2, e * speed - g * rest])
+    thrown = e * speed * rest
+    height = thrown - g * rest**2 / 2
+    velocity = e * speed - g * rest
+    return jnp.stack([height, velocity])
 
 
 X = jnp.array([1.0, 0.3, 9.81, 0.7, 0.2, 0.9])  # one bounce
@@ -65,17 +76,22 @@ def test_lanes_fail_one_by_one():
     """NaN, blow-up and a good lane in one batch; no lane disturbs another."""
     system = hj.models.BouncingBall()
     s = Structure(system)
-    q = jnp.array([[1.0, jnp.nan, 1e-3, 2.0], [0.0, 0.0, 0.0, 0.0]])
+    heights = [1.0, jnp.nan, 1e-3, 2.0]
+    speeds = [0.0, 0.0, 0.0, 0.0]
+    q = jnp.array([heights, speeds])
     chart = jnp.zeros(4, jnp.int32)
     end = jnp.full(4, 0.6)
     u = jnp.array([[0.0, 0.0, 0.0, jnp.inf]])
     lanes = start_lanes(s, jnp.zeros(4), chart, q)
-    moved = move(s, lanes, u, until(end), tight(s)).moved
+    target = until(end)
+    moved = move(s, lanes, u, target, tight(s)).moved
     bad = hj.errors.Result.BAD_INPUT
     zeno = hj.errors.Result.ZENO
-    assert moved.result.tolist() == [hj.errors.Result.OK, bad, zeno, bad]
+    codes = [hj.errors.Result.OK, bad, zeno, bad]
+    assert moved.result.tolist() == codes
     x = jnp.array([1.0, 0.0, 9.81, 0.7, 0.0, 0.6])
-    assert_allclose(moved.lanes.q[:, 0], jax.jit(ball_exact)(x), rtol=1e-12)
+    expected = jax.jit(ball_exact)(x)
+    assert_allclose(moved.lanes.q[:, 0], expected, rtol=1e-12)
 
 
 def test_new_numbers_compile_nothing():
@@ -117,10 +133,13 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     def end(x, a):
         system = Toys(roots, [a])
         zero = jnp.zeros(())
-        return flow(system, "fall", x[None], zero[None], zero, jnp.asarray(2.0))[0][0]
+        time = jnp.asarray(2.0)
+        state = flow(system, "fall", x[None], zero[None], zero, time)[0]
+        return state[0]
 
     def exact(x, a):
-        return (1 + (2 - (x + 1) / a) / 2) ** 2
+        part = (2 - (x + 1) / a) / 2
+        return (1 + part) ** 2
 
     x = jnp.array([-0.5, 0.2])
     a = 1.3
@@ -128,7 +147,8 @@ def test_gradient_of_a_mapped_flow_through_charts_that_are_not_defined_everywher
     def loss(f):
         return lambda x, a: jnp.sum(jax.vmap(f, (0, None))(x, a) ** 2)
 
-    gradient = jax.jit(jax.grad(loss(end), argnums=(0, 1)))(x, a)
+    slope = jax.grad(loss(end), argnums=(0, 1))
+    gradient = jax.jit(slope)(x, a)
     for value, true in zip(
         gradient, jax.grad(loss(exact), argnums=(0, 1))(x, a), strict=True
     ):

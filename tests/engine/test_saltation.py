@@ -49,7 +49,9 @@ class Ball(hj.HybridSystem):
 def jump_of(name, v):
     s = Structure(Ball())
     states = np.array([[0.0, v]])
-    return jump(s, s.transition_index(name), np.zeros(1), states, np.zeros((1, 1)))
+    g = s.transition_index(name)
+    no_input = np.zeros((1, 1))
+    return jump(s, g, np.zeros(1), states, no_input)
 
 
 def test_a_bounce_is_that_of_the_closed_form():
@@ -57,18 +59,22 @@ def test_a_bounce_is_that_of_the_closed_form():
     v = -3.0
     e = RESTITUTION
     bounce = jump_of("bounce", v)
-    np.testing.assert_allclose(bounce.delay_by_state, [[-1 / v, 0.0]])
+    expected_delay = [[-1 / v, 0.0]]
+    np.testing.assert_allclose(bounce.delay_by_state, expected_delay)
     by_height = -(1 + e) * G / v
-    np.testing.assert_allclose(bounce.saltation, [[[-e, 0.0], [by_height, -e]]])
+    expected = [[[-e, 0.0], [by_height, -e]]]
+    np.testing.assert_allclose(bounce.saltation, expected)
     # A floor that is higher by x is met earlier by -x / v, and lifts the ball.
     np.testing.assert_allclose(bounce.delay_by_input, [[1 / v]])
-    np.testing.assert_allclose(bounce.input_saltation, [[[1 + e], [-by_height]]])
+    expected_input = [[[1 + e], [-by_height]]]
+    np.testing.assert_allclose(bounce.input_saltation, expected_input)
 
 
 def test_no_state_delays_a_clock():
     kick = jump_of("kick", 1.5)
     np.testing.assert_array_equal(kick.delay_by_state, [[0.0, 0.0]])
-    np.testing.assert_array_equal(kick.saltation, [[[1.0, 0.0], [2.0, 1.0]]])
+    expected = [[[1.0, 0.0], [2.0, 1.0]]]
+    np.testing.assert_array_equal(kick.saltation, expected)
 
 
 def test_a_guard_that_does_not_move_has_no_delay():

@@ -22,7 +22,8 @@ def ball(restitution, duration=60.0, **options):
 
 
 def times(trajectory, name=None):
-    return np.array([e.time for e in trajectory.events if name in (None, e.name)])
+    named = [e.time for e in trajectory.events if name in (None, e.name)]
+    return np.array(named)
 
 
 def ceiling(height):
@@ -78,7 +79,8 @@ def close(gap, k):
         return q[0] - 0.5
 
     def curved(t, q, u):
-        return jnp.exp(k * (q[0] - 0.5 - gap)) - 1
+        above = q[0] - 0.5 - gap
+        return jnp.exp(k * above) - 1
 
     transitions = (
         hj.Transition("plain", "turn", "turn", plain),
@@ -118,7 +120,8 @@ BLOWUP = toy({"x": Field(("x",), x_rates)})
 
 def test_a_hundred_bounces():
     bounces = ball(1.0, 200 * FALL)
-    assert_allclose(times(bounces), FALL * np.arange(1, 200, 2), rtol=1e-11)
+    expected = FALL * np.arange(1, 200, 2)
+    assert_allclose(times(bounces), expected, rtol=1e-11)
     first = bounces.events[0]
     assert first.name == "bounce"
     assert first.source == "fall"
@@ -132,8 +135,11 @@ def test_zeno_is_seen_before_its_limit(e):
     found = ball(e, throw=False)
     limit = FALL * (1 + e) / (1 - e)
     assert found.result == hj.errors.Result.ZENO
-    assert limit * (1 - 1e-3) < found.t[-1] < limit
-    expected = FALL * (1 + 2 * e * (1 - e ** np.arange(len(found.events))) / (1 - e))
+    shortest = limit * (1 - 1e-3)
+    assert shortest < found.t[-1] < limit
+    powers = e ** np.arange(len(found.events))
+    bounces = 2 * e * (1 - powers) / (1 - e)
+    expected = FALL * (1 + bounces)
     assert_allclose(times(found), expected, rtol=1e-10)
     with pytest.raises(
         hj.errors.ComputationError, match=r"in chart 'fall': events accumulate .*Zeno"
@@ -145,14 +151,18 @@ def test_zeno_is_seen_before_its_limit(e):
 def test_grazing(gap):
     """A ball that would rise to 1 + 1e-16, under a ceiling at 1 + gap."""
     system = Toys(ceiling, [1 + gap])
-    found = hj.simulate(system, "air", (0.0, np.sqrt(2.0)), 2.0, throw=False)
-    hit = np.sqrt(2.0) - np.sqrt(max(-2 * gap, 0.0))
+    start = (0.0, np.sqrt(2.0))
+    found = hj.simulate(system, "air", start, 2.0, throw=False)
+    left = np.sqrt(max(-2 * gap, 0.0))
+    hit = np.sqrt(2.0) - left
     if abs(gap) < 1e-10:
         assert found.result == hj.errors.Result.GRAZING
-        assert np.all(np.abs(times(found) - hit) < 1e-6)
+        errors = np.abs(times(found) - hit)
+        assert np.all(errors < 1e-6)
     else:
         assert found.result == hj.errors.Result.OK
-        assert_allclose(times(found), [hit] if gap < 0 else [], atol=1e-10)
+        expected = [hit] if gap < 0 else []
+        assert_allclose(times(found), expected, atol=1e-10)
 
 
 @settings(max_examples=10)
@@ -161,8 +171,10 @@ def test_a_guard_that_dips_within_a_step_fires(exponent):
     depth = 10**exponent
     system = Toys(dip, [depth])
     found = hj.simulate(system, "dip", (1.0 - depth, 0.0), 3.0)
-    assert_allclose(times(found), [1 - np.sqrt(depth)], atol=1e-11)
-    above = hj.simulate(Toys(dip, [-depth]), "dip", (1.0 + depth, 0.0), 3.0)
+    touches = [1 - np.sqrt(depth)]
+    assert_allclose(times(found), touches, atol=1e-11)
+    dips = Toys(dip, [-depth])
+    above = hj.simulate(dips, "dip", (1.0 + depth, 0.0), 3.0)
     assert not above.events
     assert above.result == hj.errors.Result.OK
 
@@ -175,7 +187,8 @@ def test_blow_up():
     with pytest.raises(hj.errors.ComputationError, match="the state left all bounds"):
         hj.simulate(BLOWUP, "x", (1.0,), 2.0)
     decay = hj.simulate(BLOWUP, "x", (-1.0,), 2.0)
-    assert_allclose(decay.after[-1], [-1 / 3], rtol=1e-10)
+    expected = [-1 / 3]
+    assert_allclose(decay.after[-1], expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -184,14 +197,16 @@ def test_blow_up():
 )
 def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, first):
     system = Toys(turning, [low, high])
-    found = hj.simulate(system, "turn", (0.0, -1.0, 0.0), 2 * np.pi)
+    start = (0.0, -1.0, 0.0)
+    found = hj.simulate(system, "turn", start, 2 * np.pi)
     names = [e.name for e in found.events if e.name != "gated"]
     assert names[0] == first
     assert sorted(names) == ["high", "low"]
     for name, level in (("low", low), ("high", high)):
         expected = np.pi / 2 + np.arccos(level)
         assert_allclose(times(found, name), [expected], atol=1e-12)
-    assert found.after[-1, 2] == len(found.events)
+    number = len(found.events)
+    assert found.after[-1, 2] == number
 
 
 @settings(max_examples=10)
@@ -205,9 +220,11 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, fi
 )
 def test_close_crossings_of_different_shape(gap, sign, k):
     system = Toys(close, [sign * gap, k])
-    found = hj.simulate(system, "turn", (0.0, -1.0), 2 * np.pi)
+    start = (0.0, -1.0)
+    found = hj.simulate(system, "turn", start, 2 * np.pi)
     plain = np.pi / 2 + np.arccos(0.5)
-    curved = np.pi / 2 + np.arccos(0.5 + sign * gap)
+    angle = np.arccos(0.5 + sign * gap)
+    curved = np.pi / 2 + angle
     assert_allclose(times(found, "plain"), [plain], atol=1e-11)
     assert_allclose(times(found, "curved"), [curved], atol=1e-11)
     if gap > 1e-11:  # otherwise they are at the same instant, up to rounding
@@ -237,7 +254,8 @@ def test_a_tick_at_the_end_of_a_piece_happens_once(k, pieces):
     chart = "a"
     state = (0.0,)
     time = 0.0
-    for end in np.linspace(0.0, k * 0.1, pieces + 1)[1:]:
+    ends = np.linspace(0.0, k * 0.1, pieces + 1)
+    for end in ends[1:]:
         run = hj.simulate(TICK, chart, state, end - time, time=time)
         state = run.after[-1]
         time = float(run.t[-1])
@@ -250,9 +268,11 @@ def test_an_input_that_varies_in_time():
         system, "fall", (5.0, 0.0), 1.0, input=lambda t: jnp.sin(3 * t) + G
     )
     t, y = found("y")
-    assert_allclose(y[-1], 5 + 1 / 3 - np.sin(3.0) / 9, rtol=1e-10)
+    expected_end = 5 + 1 / 3 - np.sin(3.0) / 9
+    assert_allclose(y[-1], expected_end, rtol=1e-10)
     # between steps too
-    expected = 5 + t / 3 - np.sin(3 * t) / 9
+    wave = np.sin(3 * t) / 9
+    expected = 5 + t / 3 - wave
     assert_allclose(y, expected, atol=2e-5)
     constant = hj.simulate(system, "fall", (5.0, 0.0), 1.0, input=G)
     assert_allclose(constant.after[-1], [5.0, 0.0], atol=1e-14)
@@ -269,11 +289,13 @@ def test_feet_that_land_together():
     rotation = 0.0
     J = 0.2
     for s in (-0.5, 0.55):  # two impulses, one after the other
-        impulse = -0.2 * (speed + s * rotation) / (1 + s**2 / J)
+        mass = 1 + s**2 / J
+        impulse = -0.2 * (speed + s * rotation) / mass
         speed = speed + impulse
         rotation = rotation + s * impulse / J
     after = found.events[-1].after
-    assert_allclose([after["v"], after["p"]], [speed, rotation], rtol=1e-12)
+    found_rates = [after["v"], after["p"]]
+    assert_allclose(found_rates, [speed, rotation], rtol=1e-12)
 
 
 def test_samples_between_steps(reference, hopper_cycle):
@@ -285,7 +307,9 @@ def test_samples_between_steps(reference, hopper_cycle):
     for event in orbit.events:
         assert np.sum(t == event.time) == 2
     clock = np.round(t % 1, 12)
-    expected = np.interp(clock, data["orbit_clock"], data["orbit_q"][:, 0], period=1.0)
+    times = data["orbit_clock"]
+    states = data["orbit_q"][:, 0]
+    expected = np.interp(clock, times, states, period=1.0)
     assert_allclose(q[:, 0], expected, atol=2e-5)
     t2, yM, ym = orbit("yM", "ym", per_step=4)
     assert_array_equal(t2, t)
@@ -306,9 +330,11 @@ def test_every_turn_of_a_fast_guard_is_seen():
     def guard(t, q, u):
         return jnp.sin(61.0 * q[0])
 
-    fast = toy(LINE, [hj.Transition("fall", "line", "line", guard)])
+    fall = hj.Transition("fall", "line", "line", guard)
+    fast = toy(LINE, [fall])
     run = hj.simulate(fast, "line", (0.1,), 3.0)
-    falls = (2 * np.arange(1000) + 1) * np.pi / 61.0 - 0.1
+    odd = 2 * np.arange(1000) + 1
+    falls = odd * np.pi / 61.0 - 0.1
     expected = falls[(falls > 0) & (falls < 3.0)]
     assert_allclose(times(run), expected, atol=1e-12)
 
@@ -337,8 +363,10 @@ def test_an_event_at_a_tick():
     charts = {"a": Field(("x", "n", "m"), rates)}
     system = toy(charts, (fall, tick))
     run = hj.simulate(system, "a", (1.0, 0.0, 0.0), 3.5)
-    assert_allclose(run.after[-1], [0.5, 3.0, 3.0], atol=1e-12)
-    assert_allclose(times(run), [1.0, 1.0, 2.0, 2.0, 3.0, 3.0], atol=1e-12)
+    end = [0.5, 3.0, 3.0]
+    assert_allclose(run.after[-1], end, atol=1e-12)
+    expected_times = [1.0, 1.0, 2.0, 2.0, 3.0, 3.0]
+    assert_allclose(times(run), expected_times, atol=1e-12)
 
 
 @pytest.mark.parametrize("duration", [80.0, 200.0])
@@ -346,7 +374,10 @@ def test_a_first_step_that_is_far_too_long_is_rejected(duration):
     """A tenth of the time makes 1e34 of 1, and even more of rounding errors."""
 
     def duffing(t, q, cos):
-        return q[1], -0.3 * q[1] - q[0] - q[0] ** 3 + 0.3 * cos(1.2 * t)
+        cubic = q[0] ** 3
+        spring = -0.3 * q[1] - q[0] - cubic
+        push = 0.3 * cos(1.2 * t)
+        return q[1], spring + push
 
     def rates(t, q, u):
         return duffing(t, q, jnp.cos)
@@ -359,4 +390,5 @@ def test_a_first_step_that_is_far_too_long_is_rejected(duration):
     path = solve_ivp(
         scipy_rates, (0, duration), [1.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13
     )
-    assert_allclose(found.after[-1], path.y[:, -1], rtol=0, atol=1e-9)
+    expected = path.y[:, -1]
+    assert_allclose(found.after[-1], expected, rtol=0, atol=1e-9)

@@ -32,7 +32,9 @@ FAST, SLOW = sorted(np.linalg.eigvals(STIFF))
 
 # One mode decays in 3 s, one in 0.3 ms.
 def rates(t, q, u):
-    return (q[1], STIFF[1] @ q + force(t) + u[0])
+    own = STIFF[1] @ q
+    rate = own + force(t) + u[0]
+    return (q[1], rate)
 
 
 DAMPED = toy(
@@ -48,7 +50,8 @@ def force(t):
 def exact(a=20.0):
     """The state of the cycle at t = 0."""
     w = 2j * np.pi
-    y = a / (w**2 + 3e3 * w + 1e3)
+    denominator = w**2 + 3e3 * w + 1e3
+    y = a / denominator
     v = w * y
     return np.array([y.imag, v.imag])
 
@@ -65,7 +68,8 @@ def test_radau_is_a_collocation_method(stages):
         assert_allclose(a @ power, c**k / k, atol=1e-14)
         assert_allclose(error @ power, 0, atol=1e-13)
     for k in range(1, 2 * stages):
-        assert_allclose(b @ c ** (k - 1), 1 / k, rtol=0, atol=1e-14)
+        moment = b @ c ** (k - 1)
+        assert_allclose(moment, 1 / k, rtol=0, atol=1e-14)
     first_error = abs(error @ c**stages)
     assert first_error > 1e-5, "the estimate is not zero"
 
@@ -75,20 +79,25 @@ def test_no_error_of_a_stiff_step_is_hidden(rate):
     """Of a mode that follows, or is excited, by however little, and dies out within the step."""
 
     def field(t, q):
-        return -rate * (q - jnp.cos(t)) - jnp.sin(t)
+        distance = q - jnp.cos(t)
+        return -rate * distance - jnp.sin(t)
 
     excited = np.array([[0.0, 1.0, 1e-4, 1e-8]])
     h = 0.4
     radau = as_method(hj.systems.Radau())
-    step = take_step(radau, field, jnp.zeros(4), 1.0 + excited, jnp.array([h]))
-    expected = np.cos(h) + excited * np.exp(-rate * h)
+    start = 1.0 + excited
+    length = jnp.array([h])
+    step = take_step(radau, field, jnp.zeros(4), start, length)
+    transient = excited * np.exp(-rate * h)
+    expected = np.cos(h) + transient
     error = np.abs(np.asarray(step.q) - expected)
     estimate = np.asarray(step.error)
     assert np.all(error < 5 * estimate + 1e-15)
 
 
 def a_rates(t, q, u):
-    return (1.0 + 0 * q[0], -2e3 * q[1])
+    decay = -2e3 * q[1]
+    return (1.0 + 0 * q[0], decay)
 
 
 RAMP = toy({"a": Field(("x", "v"), a_rates)})
@@ -100,14 +109,19 @@ def test_a_landing_is_as_stiff_as_its_chart():
     levels = ListLevels((hj.Crossing("x", "rising", 1.0),))
     one = np.ones(1)
     none = np.zeros(1, np.int32)
-    lanes = to_host(start_lanes(s, np.zeros(1), none, np.array([[0.0], [1e-3]])))
+    state = np.array([[0.0], [1e-3]])
+    begun = start_lanes(s, np.zeros(1), none, state)
+    lanes = to_host(begun)
     target = Target(
         np.array([np.inf]), none, none - 1, 2 * one, None, levels, hj.errors.Result.OK
     )
-    settings = Settings(1e-9, 1e-9, 64, np.ones((1, 2)))
+    scale = np.ones((1, 2))
+    settings = Settings(1e-9, 1e-9, 64, scale)
     stride = Stride(one, 0.9975 * one, 1e7 * one)
-    moved = move(s, lanes, np.zeros((s.nu, 1)), target, settings, stride)
-    assert_allclose(moved.moved.lanes.q, [[1.0], [0.0]], atol=1e-7)
+    no_input = np.zeros((s.nu, 1))
+    moved = move(s, lanes, no_input, target, settings, stride)
+    states = moved.moved.lanes.q
+    assert_allclose(states, [[1.0], [0.0]], atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -120,20 +134,28 @@ def test_estimates_are_of_the_size_of_errors(solver):
 
     def field(t, q):
         x, y = q
-        return jnp.stack([-(x**2), -30 * (y - jnp.cos(t)) - jnp.sin(t)])
+        apart = y - jnp.cos(t)
+        stiff_rate = -30 * apart - jnp.sin(t)
+        return jnp.stack([-(x**2), stiff_rate])
 
-    step = take_step(method, field, jnp.zeros(1), jnp.ones((2, 1)), jnp.array([h]))
+    start = jnp.ones((2, 1))
+    length = jnp.array([h])
+    step = take_step(method, field, jnp.zeros(1), start, length)
     exact = [1 / (1 + h), np.cos(h)]
-    error = np.abs(np.asarray(step.q[:, 0]) - exact).max()
-    estimate = np.abs(np.asarray(step.estimate)).max() ** method.gain
+    found = np.asarray(step.q[:, 0])
+    error = np.abs(found - exact).max()
+    largest = np.abs(np.asarray(step.estimate)).max()
+    estimate = largest**method.gain
     assert 0.5 < estimate / error < 10
 
 
 def test_inverses_of_many_matrices():
     matrix = np.random.default_rng(0).normal(size=(5, 5, 3))
     matrix[0, 0] = 0.0  # pivots are needed
-    found = np.moveaxis(jax.jit(inverse)(matrix), -1, 0)
-    expected = np.linalg.inv(np.moveaxis(matrix, -1, 0))
+    inverses = jax.jit(inverse)(matrix)
+    found = np.moveaxis(inverses, -1, 0)
+    matrices = np.moveaxis(matrix, -1, 0)
+    expected = np.linalg.inv(matrices)
     assert_allclose(found, expected, atol=1e-12)
 
 
@@ -148,21 +170,31 @@ def test_derivatives_of_implicit_steps(solver):
 
     def end(x):
         def field(t, q, x=x):
-            return jnp.stack([-50.0 * (q[0] - jnp.sin(q[1] + x)), q[0] * q[1] + x])
+            wave = jnp.sin(q[1] + x)
+            distance = q[0] - wave
+            fast = -50.0 * distance
+            slow = q[0] * q[1] + x
+            return jnp.stack([fast, slow])
 
         still = ft.partial(field, x=jax.lax.stop_gradient(x))
-        q = jnp.stack([0.3 + x, jnp.cos(x)])[:, None]
-        return take_step(method, field, jnp.zeros(1), q, h, still=still).q[:, 0]
+        start = jnp.stack([0.3 + x, jnp.cos(x)])
+        q = start[:, None]
+        step = take_step(method, field, jnp.zeros(1), q, h, still=still)
+        return step.q[:, 0]
 
     d = 1e-2
     lowest, low, middle, high, highest = jax.jit(jax.vmap(end))(
         d * jnp.arange(-2.0, 3.0)
     )
     first = jax.jit(jax.jacfwd(end))(0.0)
-    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.0)
-    by_differences = (lowest - 8 * low + 8 * high - highest) / (12 * d)
+    curvature = jax.jacfwd(jax.jacfwd(end))
+    second = jax.jit(curvature)(0.0)
+    combined = lowest - 8 * low + 8 * high - highest
+    by_differences = combined / (12 * d)
     assert_allclose(first, by_differences, rtol=1e-6)
-    twice = (16 * (low + high) - 30 * middle - lowest - highest) / (12 * d**2)
+    near = 16 * (low + high)
+    curved = near - 30 * middle - lowest - highest
+    twice = curved / (12 * d**2)
     assert_allclose(second, twice, rtol=1e-5)
 
 
@@ -173,7 +205,8 @@ def damped():
 
 
 def test_a_stiff_cycle_with_default_settings(damped):
-    assert_allclose(list(damped.state.values()), exact(), rtol=1e-9, atol=1e-13)
+    state = list(damped.state.values())
+    assert_allclose(state, exact(), rtol=1e-9, atol=1e-13)
     assert_allclose(damped.multipliers, [np.exp(SLOW), 0.0], rtol=1e-10)
     assert_allclose(damped.log_multipliers, [SLOW, FAST], rtol=1e-9)
 
@@ -185,11 +218,15 @@ def test_linearization_of_a_stiff_system(damped):
     )
     A = model.A[0]
     B = model.B[0]
-    size = np.array([damped.scale["y"], damped.scale["v"]])
+    scales = [damped.scale["y"], damped.scale["v"]]
+    size = np.array(scales)
     ratio = size / size[:, None]
-    assert_allclose(A * ratio, exactly[:2, :2] * ratio, atol=1e-9)
+    found = A * ratio
+    exact = exactly[:2, :2] * ratio
+    assert_allclose(found, exact, atol=1e-9)
     expected = exactly[:2, 2] / size
-    assert_allclose(B[:, 0] / size, expected, rtol=1e-8, atol=1e-8)
+    by_input = B[:, 0] / size
+    assert_allclose(by_input, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_linearization_of_a_stiff_system_inside_of_a_program(damped):
@@ -200,7 +237,9 @@ def test_linearization_of_a_stiff_system_inside_of_a_program(damped):
     def matrices():
         cycle = hj.find_limit_cycle(damped.system, damped)
         model = hj.linearize(cycle, phases, ("y",))
-        return model.A[:, :2, :2], model.B[:, :2]
+        A = model.A[:, :2, :2]
+        B = model.B[:, :2]
+        return A, B
 
     outside = hj.linearize(damped, phases, ("y",))
     A, B = matrices()

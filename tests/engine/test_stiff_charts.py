@@ -49,7 +49,8 @@ def stay(heat, rate, x, z, end):
         return heat + part * np.exp(-t) + (z - heat - part) * np.exp(-rate * t) - end  # noqa: E731
 
     t = brentq(sensor, 1e-2, 10.0, xtol=1e-15, rtol=1e-15)
-    return t, heat + (x - heat) * np.exp(-t)
+    above = (x - heat) * np.exp(-t)
+    return t, heat + above
 
 
 def exact(fast=1e4, slow=5.0):
@@ -92,18 +93,23 @@ def period(cycle):
 
 @pytest.mark.slow
 def test_derivatives_under_all_transformations(cycle):
-    first = jax.jit(jax.vmap(jax.jacfwd(period(cycle))))(jnp.array([5.0, 5.5]))
+    slope = jax.jacfwd(period(cycle))
+    values = jnp.array([5.0, 5.5])
+    first = jax.jit(jax.vmap(slope))(values)
     assert_allclose(first[0], by_differences(1), rtol=1e-6)
-    backwards = jax.jit(jax.grad(period(cycle)))(5.5)
+    slope_of_period = jax.grad(period(cycle))
+    backwards = jax.jit(slope_of_period)(5.5)
     assert_allclose(backwards, first[1], rtol=1e-8)
-    twice = jax.jit(jax.jacfwd(jax.jacfwd(period(cycle))))(5.0)
+    slope = jax.jacfwd(period(cycle))
+    twice = jax.jit(jax.jacfwd(slope))(5.0)
     assert_allclose(twice, by_differences(2), rtol=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["cycle", "periodic", "steady"])
 def test_experiments(cycle, start):
-    placed = hj.sections.place_sections(cycle, [hj.AtEvent("on"), hj.AtEvent("off")])
+    events = [hj.AtEvent("on"), hj.AtEvent("off")]
+    placed = hj.sections.place_sections(cycle, events)
     model = hj.linearize(cycle, placed, outputs="x")
     rng = np.random.default_rng(0)
     u = 1e-5 * rng.normal(size=(4, 16, 1))
@@ -114,7 +120,9 @@ def test_experiments(cycle, start):
     x0 = np.zeros(2)
     if start != "cycle":
         x0 = model.periodic_state(u[0], 8)
-    assert_allclose(data.y[0], model.simulate(u[0], x0), atol=1e-10)
+    expected = model.simulate(u[0], x0)
+    assert_allclose(data.y[0], expected, atol=1e-10)
     states = placed.lanes.q
     to_next = hj.sections.section_map(cycle, placed, 0, 1)
-    assert_allclose(to_next(states[:, 0]).q, states[:, 1], rtol=1e-10)
+    found = to_next(states[:, 0]).q
+    assert_allclose(found, states[:, 1], rtol=1e-10)

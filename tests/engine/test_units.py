@@ -25,14 +25,17 @@ SIZES = np.array([[2.0, 2.0, 0.3, 4.0], [2.0, 2.0, 1.0, 1.0]])
 
 def sizes(length, time):
     """By which the hopper's states are multiplied."""
-    return length * jnp.array([1.0, 1 / time, 1.0, 1 / time])
+    rate = 1 / time
+    ratios = jnp.array([1.0, rate, 1.0, rate])
+    return length * ratios
 
 
 def begin(system, length, time):
     """A lane at the top of a hop, and one on the ground."""
     top = [2.2, 0.0, 0.3, 0.1]
     ground = [2.0, 1.9, 0.0, 0.0]
-    q = np.array([top, ground]) * sizes(length, time)
+    states = np.array([top, ground])
+    q = states * sizes(length, time)
     charts = jnp.array([0, 1], jnp.int32)
     return start_lanes(Structure(system), jnp.zeros(2), charts, q.T)
 
@@ -46,7 +49,8 @@ def flow(length, time, scale, tangents):
     settings = Settings(1e-10, 1e-10, 256, scale)
     end = until(jnp.full(2, 1.5 * time))
     options = Options(True, tangents=tangents)
-    moved, tape = move(Structure(system), lanes, u, end, settings, options=options)
+    structure = Structure(system)
+    moved, tape = move(structure, lanes, u, end, settings, options=options)
     states = moved.lanes.q.T / sizes(length, time)
     return tape.h / time, tape.code, states, moved.result
 
@@ -88,7 +92,8 @@ def test_an_oscillator_at_zero():
 
 def test_a_weight_at_rest_up_to_rounding():
     def spring(t, q, u):
-        return q[1], 9.81 - 100.3 * (q[0] - 0.1)
+        spring = 100.3 * (q[0] - 0.1)
+        return q[1], 9.81 - spring
 
     rest = 0.1 + 9.81 / 100.3
     found = simulate_rates(spring, (rest, 0.0))
@@ -100,7 +105,8 @@ def test_a_state_at_the_level_of_rounding():
         return -q[0], 1e-17 * q[0]
 
     found = simulate_rates(decay, (1.0, 0.0))
-    assert_allclose(found.after[-1], [np.exp(-10), 0.0], rtol=1e-9, atol=1e-13)
+    expected = [np.exp(-10), 0.0]
+    assert_allclose(found.after[-1], expected, rtol=1e-9, atol=1e-13)
 
 
 def test_a_chain_of_integrators_from_zero():
@@ -109,5 +115,9 @@ def test_a_chain_of_integrators_from_zero():
 
     found = simulate_rates(integrators, (0.0, 0.0, 0.0, 0.0, 0.0))
     t = 10.0
-    expected = [np.cos(t) - 1 + t**2 / 2, t - np.sin(t), 1 - np.cos(t), np.sin(t)]
-    assert_allclose(found.after[-1][1:], expected, rtol=1e-9)
+    parabola = t**2 / 2
+    bent = np.cos(t) - 1 + parabola
+    slope = t - np.sin(t)
+    expected = [bent, slope, 1 - np.cos(t), np.sin(t)]
+    end = found.after[-1][1:]
+    assert_allclose(end, expected, rtol=1e-9)

@@ -11,7 +11,12 @@ from ..linear.conftest import blocks_at_random, simulate_blocks
 
 
 BLOCKS = blocks_at_random(3, (2, 3, 1, 2), ny=2, nu=2)
-DESIGN = hj.multisine(n_sections=4, periods=5, frequencies=(0, 2.0), inputs=("a", "b"))
+DESIGN = hj.multisine(
+    n_sections=4,
+    periods=5,
+    frequencies=(0, 2.0),
+    inputs=("a", "b"),
+)
 
 
 @pytest.fixture(scope="module")
@@ -23,10 +28,12 @@ def test_simulation_from_the_cycle_is_the_definition(model):
     data = hj.experiments.simulate_experiments(model, DESIGN, discard=3)
     assert data.u.shape == (DESIGN.experiments, 8 * 4, 2)
     for u, y in zip(data.u, data.y, strict=True):
-        assert_allclose(y, simulate_blocks(BLOCKS, u, np.zeros(2))[1], atol=1e-14)
+        _, expected = simulate_blocks(BLOCKS, u, np.zeros(2))
+        assert_allclose(y, expected, atol=1e-14)
     assert data.inputs == ("a", "b")
     assert data.outputs == ("y0", "y1")
-    assert data.summary() == f"{DESIGN.experiments}/{DESIGN.experiments} ok"
+    expected_summary = f"{DESIGN.experiments}/{DESIGN.experiments} ok"
+    assert data.summary() == expected_summary
     for start, cycles in (("cycle", 25), ("periodic", 5)):
         data = hj.experiments.simulate_experiments(model, DESIGN, start=start)
         assert data.u.shape[1] == cycles * 4

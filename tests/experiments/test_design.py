@@ -14,7 +14,9 @@ from ..linear.conftest import blocks_at_random, hopper as hopper
 
 def disturb(i, j, periods):
     """Whether f = i / P and j / P differ by an integer or add up to one."""
-    return (i - j) % periods == 0 or (i + j) % periods == 0
+    difference = (i - j) % periods
+    total = (i + j) % periods
+    return difference == 0 or total == 0
 
 
 def lines_of(design, experiment):
@@ -48,7 +50,8 @@ def test_every_multisine_obeys_the_rules_at_the_exact_minimum(
     # All lines that disturb j disturb each other: so many experiments are needed at least.
     crowds = []
     for j in phases:
-        crowds.append(sum(phases[i] for i in phases if disturb(i, j, P)))
+        others = [phases[i] for i in phases if disturb(i, j, P)]
+        crowds.append(sum(others))
     needed = nu * max(crowds)
 
     smallest = hj.multisine(**arguments, seed=seed)
@@ -97,7 +100,8 @@ def require_refusals(N, P, arguments, seed):
 def require_undisturbed(design, experiment, P):
     """An experiment excites one input, by lines that do not disturb each other."""
     for i, j in itertools.combinations(lines_of(design, experiment), 2):
-        assert not disturb(i, j, P), f"lines {i} and {j} of {experiment}"
+        text = f"lines {i} and {j} of {experiment}"
+        assert not disturb(i, j, P), text
     channels = design.channel[design.experiment == experiment]
     assert len(set(channels)) == 1
 
@@ -105,7 +109,8 @@ def require_undisturbed(design, experiment, P):
 def require_phases(design, channel, phases):
     """A channel has each line in as many phases as it takes; two are a quarter period apart."""
     for j, count in phases.items():
-        here = design.phase[(design.line == j) & (design.channel == channel)]
+        is_here = (design.line == j) & (design.channel == channel)
+        here = design.phase[is_here]
         assert len(here) == count
         if count == 2:
             cosine = np.cos(here[0] - here[1])
@@ -149,13 +154,18 @@ def test_signals_are_sums_of_cosines():
     n = np.arange(9 * N)
     expected = np.zeros((design.experiments, len(n), 2))
     for k in range(len(design.line)):
-        angle = 2 * np.pi * design.line[k] / (P * N) * n + design.phase[k]
+        rate = 2 * np.pi * design.line[k] / (P * N)
+        angle = rate * n + design.phase[k]
         wave = design.amplitude[k] * np.cos(angle)
-        expected[design.experiment[k], :, design.channel[k]] += wave
+        experiment = design.experiment[k]
+        channel = design.channel[k]
+        expected[experiment, :, channel] += wave
     assert_allclose(design.signals(9), expected, atol=1e-14)
     one_round = expected[:, : P * N]
     assert_allclose(design.signals(), one_round, atol=1e-14)
-    rms = np.sqrt(np.mean(one_round**2, axis=1)).max(axis=1)
+    squares = one_round**2
+    rms_of_rounds = np.sqrt(np.mean(squares, axis=1))
+    rms = rms_of_rounds.max(axis=1)
     peak = np.abs(one_round).max(axis=(1, 2))
     assert_allclose(design.crest_factors(), peak / rms, rtol=1e-12)
 
@@ -223,7 +233,8 @@ def test_even_products_miss_the_lines(options, count):
 
     def folded(lines):
         """Lines as they are seen once in each period."""
-        return set(np.minimum(lines % periods, -lines % periods).ravel().tolist())
+        smaller = np.minimum(lines % periods, -lines % periods)
+        return set(smaller.ravel().tolist())
 
     for experiment in range(count):
         lines = np.array(lines_of(design, experiment))
@@ -238,11 +249,13 @@ def test_even_products_miss_the_lines(options, count):
 def test_several_inputs(division):
     n_inputs = 3
     n_lines = 12
-    model = hj.linear.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3, 2), 2, n_inputs))
+    blocks = blocks_at_random(5, (2, 1, 3, 2), 2, n_inputs)
+    model = hj.linear.LDTP.from_blocks(*blocks)
     design = hj.multisine(4, 8, (0, 2.0), 1.0, inputs=n_inputs, division=division)
     assert design.experiments == n_inputs * 4
     assert len(design.frequencies) == n_lines
-    acts = np.abs(design.signals()).max(axis=1) > 0
+    peaks = np.abs(design.signals()).max(axis=1)
+    acts = peaks > 0
     if division == "random":
         assert acts.mean() == 1 / 3
     elif division == "orthogonal":

@@ -17,7 +17,9 @@ def require_mean(each, expected):
     """The mean over independent experiments, (S, ...), is what is expected but for four standard
     errors."""
     error = each.std(axis=0) / np.sqrt(len(each))
-    assert (np.abs(each.mean(axis=0) - expected) < 4 * error).all()
+    mean = each.mean(axis=0)
+    apart = np.abs(mean - expected)
+    assert (apart < 4 * error).all()
 
 
 def require_color(x, std, memory):
@@ -26,23 +28,33 @@ def require_color(x, std, memory):
     std = np.broadcast_to(std, (N, x.shape[2]))
     cycles = x.reshape(len(x), -1, *std.shape)
     require_mean((cycles**2).mean(axis=1), std**2)
-    require_mean(x[:, 0] ** 2, std[0] ** 2)
+    square = x[:, 0] ** 2
+    require_mean(square, std[0] ** 2)
 
-    normal = x / np.resize(std, x.shape[1:])
+    std_of_each = np.resize(std, x.shape[1:])
+    normal = x / std_of_each
     for lag in (1, 3, N, 4 * N):
-        products = normal[:, lag:] * normal[:, :-lag]
-        expected = np.exp(-lag / (N * memory)) if memory else 0.0
+        later = normal[:, lag:]
+        earlier = normal[:, :-lag]
+        products = later * earlier
+        expected = 0.0
+        if memory:
+            expected = np.exp(-lag / (N * memory))
         require_mean(products.mean(axis=1), expected)
     # Different signals have no correlation.
-    products = normal[:, :, 0] * normal[:, :, 1]
+    first = normal[:, :, 0]
+    second = normal[:, :, 1]
+    products = first * second
     require_mean(products.mean(axis=1), 0.0)
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.2, 3.0])
 @pytest.mark.parametrize("std", [0.7, STD])
 def test_process_noise_has_the_color_that_it_says(std, memory):
-    x = ProcessNoise(std, seed=1, memory=memory).draw((COUNT, N * CYCLES, 2), N)
-    require_color(x, np.broadcast_to(std, N)[:, None], memory)
+    noise = ProcessNoise(std, seed=1, memory=memory)
+    x = noise.draw((COUNT, N * CYCLES, 2), N)
+    std_of_sections = np.broadcast_to(std, N)[:, None]
+    require_color(x, std_of_sections, memory)
 
 
 @pytest.fixture(scope="module")

@@ -38,9 +38,12 @@ def test_host_and_program_try_the_same_ways(name, monkeypatch):
     xla = plan._try_ways(placed, settings, no_input)
 
     # Ends are times and states, at the section after each.
-    states = np.asarray(cycle.settings.scale)[np.asarray(placed.lanes.chart)]
+    scale = np.asarray(cycle.settings.scale)
+    charts = np.asarray(placed.lanes.chart)
+    states = scale[charts]
     times = np.full((7, 1), float(cycle.period))
-    sizes = np.roll(np.concatenate([times, states], axis=1), -1, axis=0)
+    rows = np.concatenate([times, states], axis=1)
+    sizes = np.roll(rows, -1, axis=0)
     sizes = sizes.T[:, None, None]
     assert_allclose(host.ends / sizes, xla.ends / sizes, atol=1e-13)
     # Estimates are differences in which the digits of small ones cancel.
@@ -72,5 +75,6 @@ def test_errors_are_followed_from_their_section_on():
 )
 def test_errors_of_all_sections_add_up(scale, largest):
     """x1 = 2 x0 + 1 and x0 = x1 / 10 + 1, once they have."""
-    found = plan._accumulated(BACK_AND_FORTH, np.ones((2, 1)), np.array(scale)[:, None])
+    column = np.array(scale)[:, None]
+    found = plan._accumulated(BACK_AND_FORTH, np.ones((2, 1)), column)
     assert found == pytest.approx(largest, rel=1e-5)

@@ -66,21 +66,27 @@ def test_the_papers_protocol_identifies_the_hopper(family, design, hopper_cycle)
 
 def test_records_agree_with_scipy(family, design):
     name, placed, _, data = family
-    apex = np.array([float(placed.lanes.t[0]), *np.asarray(placed.lanes.q[:, 0])])
+    begin = float(placed.lanes.t[0])
+    state = np.asarray(placed.lanes.q[:, 0])
+    apex = np.array([begin, *state])
     x, y = hopper_scipy.plane(apex)
     angle = np.arctan2(y, x)
     cycle = np.asarray(data.cycle_outputs)
     point = apex
     deviations = []
     for n in range(40):  # a cycle and a quarter: liftoff, touchdown, liftoff
-        deviations.append(point[1:3] - cycle[n % N])
+        on_cycle = cycle[n % N]
+        deviations.append(point[1:3] - on_cycle)
         turn = (n + 1) / N
         if name == "isochron":
             section = ("clock", apex[0] + turn)
         else:
             section = ("angle", angle - 2 * np.pi * turn)
-        point = hopper_scipy.flow(point, section, data.u[3, n, 0])
-    error = np.abs(np.array(deviations) - data.y[3, :40])
+        push = data.u[3, n, 0]
+        point = hopper_scipy.flow(point, section, push)
+    found = np.array(deviations)
+    simulated = data.y[3, :40]
+    error = np.abs(found - simulated)
     scale = np.ptp(cycle, axis=0)
     assert np.max(error / scale) < 1e-8
 
@@ -97,8 +103,10 @@ def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, des
     others = np.arange(80) != 17
     assert_allclose(broken.y[others], data.y[others], atol=1e-9)
     after = broken.failed_at[17] + 1
-    assert np.all(np.isfinite(broken.y[17, :after]))
-    assert np.all(np.isnan(broken.y[17, after:]))
+    known = broken.y[17, :after]
+    assert np.all(np.isfinite(known))
+    after_failure = broken.y[17, after:]
+    assert np.all(np.isnan(after_failure))
     estimate = hj.estimate_htf(broken)
     lost = design.frequency[design.experiment == 17]
     assert_array_equal(estimate.frequencies, np.setdiff1d(design.frequencies, lost))
@@ -112,7 +120,8 @@ def test_large_inputs_that_change_the_order_of_events_are_reported(
         hopper_cycle, placed_isochrons, u, OUTPUTS, discard=20, **BATCH
     )
     assert 0 < data.ok.sum() < 80
-    measured = {hj.errors.Result(int(r)) for r in data.result[~data.ok]}
+    failed = data.result[~data.ok]
+    measured = {hj.errors.Result(int(r)) for r in failed}
     assert measured == {hj.errors.Result.EVENT_ORDER}
 
 
@@ -168,7 +177,8 @@ def scipy_speeds(v, inputs):
         speeds.append(v)
 
         def rates(t, q, u=u):
-            return q[1], (1 - q[0] ** 2) * q[1] - q[0] + u
+            damping = (1 - q[0] ** 2) * q[1]
+            return q[1], damping - q[0] + u
 
         path = solve_ivp(
             rates, (0, 9), (0.0, v), "DOP853", events=x, rtol=1e-13, atol=1e-13
@@ -189,10 +199,13 @@ def test_one_section_whose_way_to_the_next_is_a_whole_turn(vanderpol_cycle):
     assert (data.failed_at == -1).all()
 
     start = float(placed.lanes.q[1, 0])
-    true = np.array([scipy_speeds(start, inputs) for inputs in u[:, :, 0]])
-    found = data.y[:, :, 0] + data.cycle_outputs[:, 0]
+    forces = u[:, :, 0]
+    true = np.array([scipy_speeds(start, inputs) for inputs in forces])
+    deviation = data.y[:, :, 0]
+    found = deviation + data.cycle_outputs[:, 0]
     size = np.abs(true).max()
-    error = np.abs(found - true).max(axis=1) / size
+    largest = np.abs(found - true).max(axis=1)
+    error = largest / size
     assert np.ptp(true) > 0.1 * size, "the inputs do something"
     assert np.all(error <= data.error)
     assert np.all(data.error < 1e-8)
@@ -241,16 +254,19 @@ def test_experiments_judge_errors_by_the_sizes_of_the_cycle():
     expected = hj.experiments.simulate_experiments(model, design).y
     assert_allclose(data.y, expected, atol=1e-9)
     scales = hj.experiments.response_function(resting, family, "x").stepping.scales
-    sizes = [float(resting.period), *(resting.scale[name] for name in "xv"), 1.0]
+    of_states = [resting.scale[name] for name in "xv"]
+    sizes = [float(resting.period), *of_states, 1.0]
     assert_array_equal(scales, np.tile(sizes, (4, 1)))
 
 
 def pick(hopper):
-    return [getattr(hopper, name) for name in ("m", "M", "k", "b", "l0", "a", "g")]
+    parameters = ("m", "M", "k", "b", "l0", "a", "g")
+    return [getattr(hopper, name) for name in parameters]
 
 
 def central(f, x, e=1e-4):
-    return np.array([(f(x + d) - f(x - d)) / (2 * e) for d in e * np.eye(len(x))])
+    steps = e * np.eye(len(x))
+    return np.array([(f(x + d) - f(x - d)) / (2 * e) for d in steps])
 
 
 @pytest.mark.slow
@@ -272,7 +288,8 @@ def test_reverse_and_forward_mode_agree_with_differences(family, lossy_cycle):
     value = jax.jit(loss)
     _, result = value(x, u)
     assert result == hj.errors.Result.OK
-    reverse_mode = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))
+    both = jax.grad(loss, argnums=(0, 1), has_aux=True)
+    reverse_mode = jax.jit(both)
     (by_x, by_u), _ = reverse_mode(x, u)
     forward_mode = jax.jit(jax.jacfwd(loss, has_aux=True))
     forward, _ = forward_mode(x, u)
@@ -298,11 +315,13 @@ class Restarted(hj.HybridSystem):
 
     def start(self):
         p = self.polynomial()
-        return (p(0.0), *(p.deriv(k)(0.0) for k in range(1, 6)))
+        derivatives = [p.deriv(k)(0.0) for k in range(1, 6)]
+        return (p(0.0), *derivatives)
 
     def charts(self):
         def rates(t, q, u):
-            return (q[1] + u[0], *q[2:], 0.0)
+            first = q[1] + u[0]
+            return (first, *q[2:], 0.0)
 
         return {"run": Field(tuple("abcdef"), rates)}
 
@@ -331,8 +350,10 @@ def test_no_event_is_missed_between_sections_a_period_apart():
     guess = hj.Guess("run", Restarted().start(), 0.0)
     cycle = hj.find_limit_cycle(Restarted(), guess)
     assert cycle.event_sequence == (0, 0, 0, 1)
-    u = 1e-3 * np.random.default_rng(0).normal(size=(10, 20, 1))
-    data = hj.run_experiments(cycle, hj.ClockPhase(1), u, ("a",), discard=0)
+    rng = np.random.default_rng(0)
+    u = 1e-3 * rng.normal(size=(10, 20, 1))
+    section = hj.ClockPhase(1)
+    data = hj.run_experiments(cycle, section, u, ("a",), discard=0)
     assert data.ok.all(), data.summary()
 
 
@@ -379,4 +400,5 @@ def test_charts_without_a_common_state_need_outputs():
         "no state is in all charts of Flash, to be recorded by default: give `outputs`"
     )
     with pytest.raises(hj.errors.DefinitionError, match=says):
-        hj.run_experiments(cycle, hj.AtEvent("cool"), np.zeros((1, 30, 1)))
+        no_input = np.zeros((1, 30, 1))
+        hj.run_experiments(cycle, hj.AtEvent("cool"), no_input)

@@ -39,9 +39,13 @@ def run(placed):
 def test_experiments_start_in_their_periodic_response(run, start, least, most):
     data = run(DESIGN, start=start)
     n = DESIGN.signals().shape[1]
-    assert least <= np.abs(data.y[:, :n] - data.y[:, n:]).max() < most
+    first = data.y[:, :n]
+    second = data.y[:, n:]
+    change = np.abs(first - second)
+    assert least <= change.max() < most
     with no_compilation(after=lambda: run(DESIGN, start=start)):
-        run(hj.multisine(4, 3, (0, 1.2), 0.05, seed=2), start=start)
+        design = hj.multisine(4, 3, (0, 1.2), 0.05, seed=2)
+        run(design, start=start)
 
 
 def test_experiments_from_which_a_steady_start_was_found_are_not_repeated(run):
@@ -81,7 +85,8 @@ def test_process_noise_acts_but_is_not_recorded(run):
     assert_array_equal(once.y, noisy(1e-3).y)
     change = np.std(once.y - still.y)
     assert 1e-5 < change < 1e-2
-    assert_allclose(np.std(noisy(5e-4).y - still.y), change / 2, rtol=0.02)
+    noise = np.std(noisy(5e-4).y - still.y)
+    assert_allclose(noise, change / 2, rtol=0.02)
 
 
 def test_small_inputs_of_a_controller_have_the_effect_of_the_linearization(run, placed):
@@ -97,7 +102,8 @@ def test_small_inputs_of_a_controller_have_the_effect_of_the_linearization(run, 
     y = np.stack([loop.simulate(experiment) for experiment in reference])
     tolerance = 1e-3 * np.abs(y).max()
     assert_allclose(data.y, y, rtol=0, atol=tolerance)
-    u = reference - np.stack([controller.simulate(output) for output in y])
+    feedback = np.stack([controller.simulate(output) for output in y])
+    u = reference - feedback
     tolerance = 1e-3 * np.abs(u).max()
     expected = np.dstack([u, reference])
     assert_allclose(data.u, expected, rtol=0, atol=tolerance)

@@ -57,7 +57,8 @@ def records(parts):
 
 def test_parts_of_a_design_have_the_inputs_of_the_whole():
     u = DESIGN.signals(9)
-    parts = [DESIGN.signals(9, slice(k, k + 5)) for k in range(0, COUNT, 5)]
+    starts = range(0, COUNT, 5)
+    parts = [DESIGN.signals(9, slice(k, k + 5)) for k in starts]
     assert_array_equal(np.concatenate(parts), u)
     for wrong in (slice(3, 3), slice(0, 9, 2), slice(COUNT, None)):
         with pytest.raises(
@@ -68,7 +69,8 @@ def test_parts_of_a_design_have_the_inputs_of_the_whole():
 
 def test_a_stream_gives_the_records_and_the_estimate_of_the_whole(arguments, whole):
     parts = list(hj.run_experiments(*arguments, **BATCH, chunk=5))
-    assert [len(part.u) for part in parts] == [5, 5, 2]
+    lengths = [len(part.u) for part in parts]
+    assert lengths == [5, 5, 2]
     assert_array_equal(records(parts), whole.y)
     estimate = hj.estimate_htf(part for part in parts)
     expected = hj.estimate_htf(whole)
@@ -106,8 +108,10 @@ def test_batches_are_alike_and_keep_all_workers_busy():
             if S >= 64 * workers:  # every worker has about the same to do
                 assert used == workers
                 assert number * size < 1.2 * S
-    assert divide(1000, hj.scale.Execution(256, 8)) == hj.scale.Execution(256, 4)
-    assert divide(80, hj.scale.Execution(workers=2)) == hj.scale.Execution(40, 2)
+    whole = hj.scale.Execution(256, 8)
+    assert divide(1000, whole) == hj.scale.Execution(256, 4)
+    halves = divide(80, hj.scale.Execution(workers=2))
+    assert halves == hj.scale.Execution(40, 2)
 
 
 def test_stored_experiments_are_those_of_the_whole(made, whole):
@@ -115,15 +119,20 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     assert made.experiments == COUNT
     assert made.missing() == []
     assert_array_equal(records(made), whole.y)
-    assert_array_equal(np.concatenate([part.u for part in made]), whole.u)
-    assert_array_equal(np.concatenate([part.error for part in made]), whole.error)
+    inputs = np.concatenate([part.u for part in made])
+    assert_array_equal(inputs, whole.u)
+    errors = np.concatenate([part.error for part in made])
+    assert_array_equal(errors, whole.error)
     assert_array_equal(made[0].cycle_outputs, whole.cycle_outputs)
     assert made[0].outputs[0].unit == "m"
     assert made.summary() == whole.summary() == "12/12 ok"
     assert "12 experiments, 3 of 3 chunks" in repr(StoredExperiments(made.address))
     assert made.dataset.y.dims == ("experiment", "sample", "output")
-    assert_array_equal(made.dataset.y.sel(output="v"), whole.y[..., 1])
-    assert_allclose(hj.estimate_htf(made).H, hj.estimate_htf(whole).H, rtol=1e-9)
+    stored = made.dataset.y.sel(output="v")
+    assert_array_equal(stored, whole.y[..., 1])
+    found = hj.estimate_htf(made).H
+    expected = hj.estimate_htf(whole).H
+    assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):
@@ -175,7 +184,8 @@ def test_other_experiments_are_refused(made, arguments):
     )
     names = ("cycle", "sections", "design", "outputs")
     for change, difference in cases:
-        call = dict(zip(names, arguments, strict=True)) | dict(chunk=5) | BATCH | change
+        call = dict(zip(names, arguments, strict=True))
+        call |= dict(chunk=5) | BATCH | change
         with pytest.raises(
             hj.errors.DefinitionError, match=f"holds other results: .*{difference}"
         ):
@@ -189,9 +199,12 @@ def test_another_process_can_run_a_piece(arguments, start):
     """It gets all but what is compiled, and gives the same records."""
     cloudpickle = pytest.importorskip("cloudpickle")
     options = RunOptions(start=start, discard=8)
-    job = ExperimentJob(prepare(*arguments, options, 2), Blocks((COUNT,), (2,)))
+    plan = prepare(*arguments, options, 2)
+    blocks = Blocks((COUNT,), (2,))
+    job = ExperimentJob(plan, blocks)
     _, layout = job.begin()
-    sent = cloudpickle.loads(cloudpickle.dumps(job.resume(layout, job.arrays())))
+    pickled = cloudpickle.dumps(job.resume(layout, job.arrays()))
+    sent = cloudpickle.loads(pickled)
     mine = job.run(0, None)
     theirs = sent.run(0, 1)
     assert mine.keys() == theirs.keys()
@@ -204,8 +217,10 @@ def test_parts_that_do_not_fit_together_and_folders_that_are_no_store(
 ):
     other = hj.experiments.ExperimentData(whole.u, whole.y, n_sections=8, periods=4)
     n = np.arange(64)[None, :, None]
-    good = np.cos(2 * np.pi * n / 64 * 3)
-    high = np.cos(2 * np.pi * n / 64 * 19)
+    phase = 2 * np.pi * n / 64
+    good = np.cos(phase * 3)
+    fast = 2 * np.pi * n / 64 * 19
+    high = np.cos(fast)
     good, bad = (
         hj.experiments.ExperimentData(u, u, n_sections=4, periods=16)
         for u in (good, good + high)

@@ -27,7 +27,8 @@ def campaign():
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     sizes = np.linspace(0.005, 0.3, EXPERIMENTS)[:, None, None]
     rng = np.random.default_rng(1)
-    u = sizes * rng.normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
+    draws = rng.normal(size=(EXPERIMENTS, 16 * CYCLES, 1))
+    u = sizes * draws
     return prepare(cycle, FAMILY, u, ("yM", "vM"), RunOptions(discard=0))
 
 
@@ -35,7 +36,8 @@ def campaign():
 def responses(campaign):
     """By the search; along the table near the cycle; and along that for other experiments."""
     u = campaign.inputs.part(slice(0, EXPERIMENTS))
-    start = np.tile(np.asarray(campaign.placed.section_zero)[:, None], EXPERIMENTS)
+    begin = np.asarray(campaign.placed.section_zero)
+    start = np.tile(begin[:, None], EXPERIMENTS)
     arguments = campaign._arguments(u, start, slice(0, EXPERIMENTS))
     made = tables(campaign.placed, campaign.stepping.plan)
     assert made is not None
@@ -49,9 +51,12 @@ def responses(campaign):
 def test_lanes_that_leave_the_table_say_so(campaign, responses):
     """What follows the table is as accurate as planned; some lanes leave it, and some do not."""
     searched, *along = responses
-    sizes = np.abs(np.asarray(searched.y)).max(axis=(0, 1))
+    magnitude = np.abs(np.asarray(searched.y))
+    sizes = magnitude.max(axis=(0, 1))
     for part, left in along:
-        error = np.abs(np.asarray(part.y) - np.asarray(searched.y)) / sizes
+        searched_y = np.asarray(searched.y)
+        difference = np.asarray(part.y) - searched_y
+        error = np.abs(difference) / sizes
         follows = ~np.asarray(left)
         assert 0 < follows.sum() < EXPERIMENTS
         assert (np.asarray(searched.result)[follows] == 0).all()
@@ -61,18 +66,23 @@ def test_lanes_that_leave_the_table_say_so(campaign, responses):
 def test_an_event_may_change_places_with_a_section(responses):
     """With rows for an event in the intervals beside its own, and shorter steps, fewer leave."""
     _, (_, near), (_, far) = responses
-    assert not (np.asarray(far) & ~np.asarray(near)).any()
-    assert np.asarray(far).sum() < np.asarray(near).sum()
+    far_alone = np.asarray(far) & ~np.asarray(near)
+    assert not far_alone.any()
+    far_count = np.asarray(far).sum()
+    assert far_count < np.asarray(near).sum()
 
 
 def test_experiments_that_leave_the_table_are_run_again(campaign, responses):
     """`run` returns what a search finds, whatever the table can follow."""
     searched = responses[0]
     data = campaign.run()
-    y = data.y + np.resize(data.cycle_outputs, data.y.shape[1:])
+    on_cycle = np.resize(data.cycle_outputs, data.y.shape[1:])
+    y = data.y + on_cycle
     assert_array_equal(data.result, searched.result)
-    sizes = np.abs(np.asarray(searched.y)).max(axis=(0, 1))
-    error = np.nanmax(np.abs(y - searched.y) / sizes)
+    magnitude = np.abs(np.asarray(searched.y))
+    sizes = magnitude.max(axis=(0, 1))
+    apart = np.abs(y - searched.y) / sizes
+    error = np.nanmax(apart)
     assert error < 2e-9
 
 
@@ -83,6 +93,7 @@ def test_other_inputs_and_parameters_compile_nothing(campaign):
     campaign.run()
     count = len(compilation._by_text)
     other = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.5))
-    u = jnp.zeros((EXPERIMENTS, 16 * CYCLES, 1)) + 1e-3
+    none = jnp.zeros((EXPERIMENTS, 16 * CYCLES, 1))
+    u = none + 1e-3
     hj.run_experiments(other, FAMILY, u, ("yM", "vM"), discard=0)
     assert len(compilation._by_text) == count

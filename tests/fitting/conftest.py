@@ -17,7 +17,10 @@ class Charge(hj.Chart):
     def field(self, t, q, u):
         o = self.oscillator
         x, v = q
-        return v, o.p * o.q * (1 - x**2) * v - o.w**2 * x + u[0]
+        negative = o.p * o.q * (1 - x**2)
+        damping = negative * v
+        spring = o.w**2 * x
+        return v, damping - spring + u[0]
 
 
 class Oscillator(hj.HybridSystem):
@@ -42,7 +45,8 @@ def oscillation():
 @pytest.fixture(scope="session")
 def hopper_htf(hopper_cycle):
     ldtp = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS)
-    return ldtp.htf(np.arange(0.1, 4, 0.2), (-1, 0, 1))
+    f = np.arange(0.1, 4, 0.2)
+    return ldtp.htf(f, (-1, 0, 1))
 
 
 @pytest.fixture(scope="session")

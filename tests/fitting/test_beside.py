@@ -23,7 +23,8 @@ def test_a_program_finds_what_the_search_finds(monkeypatch):
     changed places since the last known cycle."""
     cycle = hj.find_limit_cycle(TRUE)
     lines = np.linspace(0.02, 0.48, 12)
-    htf = hj.linearize(cycle, SECTIONS, OUTPUTS).htf(lines, (-1, 0, 1))
+    model = hj.linearize(cycle, SECTIONS, OUTPUTS)
+    htf = model.htf(lines, (-1, 0, 1))
     data = hj.fitting.ObservedHTF(htf, SECTIONS)
     start = hj.models.VerticalHopper(k=1.08 * TRUE.k, b=0.95 * TRUE.b)
     expected = hj.fit_model(start, data, ("k", "b"))
@@ -35,11 +36,13 @@ def test_a_program_finds_what_the_search_finds(monkeypatch):
     monkeypatch.setattr(beside, "evaluate", no_search)
     fit = hj.fit_model(start, data, ("k", "b"))
     assert fit.result == hj.errors.Result.OK
-    np.testing.assert_allclose(fit.values, [TRUE.k, TRUE.b], rtol=1e-8)
+    true = [TRUE.k, TRUE.b]
+    np.testing.assert_allclose(fit.values, true, rtol=1e-8)
     np.testing.assert_allclose(fit.values, expected.values, rtol=1e-8)
     # (The Jacobian, by relative changes of the parameters.)
     found, known = (x.identifiability.sensitivity for x in (fit, expected))
-    np.testing.assert_allclose(found, known, rtol=0, atol=1e-6 * np.abs(known).max())
+    atol = 1e-6 * np.abs(known).max()
+    np.testing.assert_allclose(found, known, rtol=0, atol=atol)
 
 
 @pytest.mark.slow

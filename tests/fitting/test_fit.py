@@ -17,7 +17,8 @@ STD = {"std": 1e-3, "period_std": 1e-3}
 
 def observed(cycle, noise=0.0):
     """Outputs at four phases, and the period."""
-    values, _, period = hj.fitting.ObservedCycle.of(cycle, PHASES, ("x", "v")).measured
+    observed = hj.fitting.ObservedCycle.of(cycle, PHASES, ("x", "v"))
+    values, _, period = observed.measured
     drawn = noise * np.random.default_rng(0).normal(size=9)
     values = values + drawn[:8].reshape(4, 2)
     return hj.fitting.ObservedCycle(
@@ -29,9 +30,11 @@ def test_a_fit_that_stops_where_cycles_end_has_not_converged():
     """Steps toward 3 are rejected beyond 1, where there is no cycle, until they are tiny."""
 
     def evaluate(problem, x, guess):
-        return np.where(x < 1, x - 3, np.inf), np.eye(1), guess
+        residual = np.where(x < 1, x - 3, np.inf)
+        return residual, np.eye(1), guess
 
-    *_, steps, converged = problem.descend(None, np.zeros(1), None, evaluate)
+    start = np.zeros(1)
+    *_, steps, converged = problem.descend(None, start, None, evaluate)
     assert steps < problem.MAX_STEPS
     assert not converged
 
@@ -52,20 +55,21 @@ def test_the_unit_of_residuals_does_not_count():
 
 
 def test_errors_that_no_residual_shows_are_unknown():
-    juggler, impact = hj.models.PaddleJuggler(), [hj.AtEvent("impact")]
-    fit = hj.fit_model(juggler, hj.fitting.ObservedCycle(impact, times=[0.15]), "A")
-    assert fit.result == hj.errors.Result.OK and np.isnan(fit.standard_errors).all()
+    juggler = hj.models.PaddleJuggler()
+    impact = [hj.AtEvent("impact")]
+    cycle = hj.fitting.ObservedCycle(impact, times=[0.15])
+    fit = hj.fit_model(juggler, cycle, "A")
+    assert fit.result == hj.errors.Result.OK
+    assert np.isnan(fit.standard_errors).all()
     with pytest.raises(hj.errors.DefinitionError, match="no residual is left"):
         fit.contains({"A": 0.2})
     speed = hj.fitting.ObservedCycle(
         impact, "v", [[-3.0]]
     )  # which is g T / 2 for any amplitude
     fit = hj.fit_model(juggler, speed, "A")
-    assert (
-        fit.result == hj.errors.Result.OK
-        and fit.identifiability.rank == 0
-        and fit.contains({"A": 0.2})
-    )
+    assert fit.result == hj.errors.Result.OK
+    assert fit.identifiability.rank == 0
+    assert fit.contains({"A": 0.2})
     with pytest.raises(hj.errors.DefinitionError, match="of all data, or of none"):
         hj.fitting.identifiability(
             juggler,
@@ -76,8 +80,10 @@ def test_errors_that_no_residual_shows_are_unknown():
 
 @pytest.mark.slow
 def test_times_of_autonomous_cycles_count_from_any_moment():
-    where = [hj.Crossing("x", "rising"), hj.Crossing("v", "rising")]
-    cycles = [hj.find_limit_cycle(hj.models.VanDerPol(mu=mu)) for mu in (1.1, 1.101)]
+    position = hj.Crossing("x", "rising")
+    where = [position, hj.Crossing("v", "rising")]
+    systems = [hj.models.VanDerPol(mu=mu) for mu in (1.1, 1.101)]
+    cycles = [hj.find_limit_cycle(system) for system in systems]
     (gap,), (other,) = (
         np.diff(hj.sections.place_sections(x, where).lanes.t) for x in cycles
     )
@@ -90,16 +96,19 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
             where, times=[begin, begin + gap], times_std=0.1
         )
         fit = hj.fit_model(hj.models.VanDerPol(), data, "mu")
-        assert fit.dof == 0 and fit.values == pytest.approx(1.1, rel=1e-9)
+        assert fit.dof == 0
+        assert fit.values == pytest.approx(1.1, rel=1e-9)
         assert fit.standard_errors == pytest.approx(error, rel=0.01)
         data = hj.fitting.ObservedCycle(
             where, "x", [[0.1], [-2.0]], times=[begin, begin + gap]
         )
-        rough.append(hj.fit_model(hj.models.VanDerPol(), data, {"mu": (0.0, np.inf)}))
-    assert rough[0].values == pytest.approx(rough[1].values, rel=1e-6)
-    assert rough[0].result == 0 and "mu reaches its bound 0 within its error" in repr(
-        rough[0]
-    )
+        oscillator = hj.models.VanDerPol()
+        bounds = {"mu": (0.0, np.inf)}
+        rough.append(hj.fit_model(oscillator, data, bounds))
+    first_values = rough[0].values
+    assert first_values == pytest.approx(rough[1].values, rel=1e-6)
+    assert rough[0].result == 0
+    assert "mu reaches its bound 0 within its error" in repr(rough[0])
     with pytest.raises(
         hj.errors.DefinitionError, match="another 'mass', which was not fitted"
     ):
@@ -109,19 +118,27 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
 @pytest.mark.slow
 def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
     wrong = Oscillator(p=0.6, q=2.1, w=0.9)
-    fit = hj.fit_model(wrong, observed(oscillation), ("p", "q", "w"), guess=oscillation)
-    assert fit.result == hj.errors.Result.OK and fit.cost < 1e-12
+    data = observed(oscillation)
+    fit = hj.fit_model(wrong, data, ("p", "q", "w"), guess=oscillation)
+    assert fit.result == hj.errors.Result.OK
+    assert fit.cost < 1e-12
     assert fit.system.w == pytest.approx(1.0, rel=1e-9)
-    assert fit.system.p * fit.system.q == pytest.approx(1.0, rel=1e-9)
+    product = fit.system.p * fit.system.q
+    assert product == pytest.approx(1.0, rel=1e-9)
     assert fit.system.p / fit.system.q == pytest.approx(
         0.6 / 2.1, rel=1e-6
     )  # it did not move
     assert fit.identifiability.descriptions() == ["p and q apart, only their product"]
-    assert np.isinf(fit.standard_errors).tolist() == [True, True, False]
-    assert float(fit.cycle.period) == pytest.approx(float(oscillation.period), rel=1e-9)
+    unknown = np.isinf(fit.standard_errors)
+    assert unknown.tolist() == [True, True, False]
+    period = float(fit.cycle.period)
+    true_period = float(oscillation.period)
+    assert period == pytest.approx(true_period, rel=1e-9)
     (lost,) = fit.findings
-    assert lost.cause == "not identified" and lost.text.startswith("p and q apart")
-    assert repr(lost) in repr(fit) and "1 of 1 guesses" in repr(fit)
+    assert lost.cause == "not identified"
+    assert lost.text.startswith("p and q apart")
+    assert repr(lost) in repr(fit)
+    assert "1 of 1 guesses" in repr(fit)
     np.testing.assert_allclose(fit.multipliers, oscillation.multipliers, atol=1e-8)
     assert isinstance(fit, hj.identify.Fit)
 
@@ -129,8 +146,11 @@ def test_an_oscillator_comes_back_up_to_what_cannot_be_seen(oscillation):
 @pytest.mark.slow
 def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
     data = observed(oscillation, noise=1e-3)
-    fit = hj.fit_model(Oscillator(w=1.02), data, ("p", "q", "w"), guess=oscillation)
-    assert fit.weighted and fit.dof == 7 and fit.result == hj.errors.Result.OK
+    rough_guess = Oscillator(w=1.02)
+    fit = hj.fit_model(rough_guess, data, ("p", "q", "w"), guess=oscillation)
+    assert fit.weighted
+    assert fit.dof == 7
+    assert fit.result == hj.errors.Result.OK
     assert 0 < fit.chi_square(oscillation.system) < 13.8  # 0.1 %
     assert fit.contains({"p": 0.5, "q": 2.0, "w": 1.0}, level=0.999)
     assert not fit.contains({"p": 0.5, "q": 2.0, "w": 1.1})
@@ -143,19 +163,25 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
         )
 
     usual = numbers()
-    J = np.stack([numbers(p=0.501) - usual, numbers(w=1.001) - usual], axis=1) / 1e-3
-    errors = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
-    assert fit.standard_errors[2] == pytest.approx(errors[1], rel=0.02)
+    by_p = numbers(p=0.501) - usual
+    by_w = numbers(w=1.001) - usual
+    J = np.stack([by_p, by_w], axis=1) / 1e-3
+    covariance = np.linalg.inv(J.T @ J)
+    errors = np.sqrt(np.diag(covariance))
+    error_of_w = fit.standard_errors[2]
+    assert error_of_w == pytest.approx(errors[1], rel=0.02)
     with pytest.raises(hj.errors.DefinitionError, match="the other values lack 'w'"):
         fit.contains({"p": 0.5, "q": 2.0})
-    unseen = eqx.tree_at(lambda o: o.measured[1], data, np.nan * data.measured[1])
+    no_values = np.nan * data.measured[1]
+    unseen = eqx.tree_at(lambda o: o.measured[1], data, no_values)
     with pytest.raises(hj.errors.ComputationError, match="residuals are not finite"):
         hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
 
 def test_advice_about_searches_names_their_function(oscillation):
     still, data = Oscillator(w=0.0), observed(oscillation)
-    far, free = hj.Guess("charge", (9e9, 0.0)), ("p",)
+    far = hj.Guess("charge", (9e9, 0.0))
+    free = ("p",)
     for call in (
         lambda: hj.fit_model(still, data, free, guess=far),
         lambda: hj.fitting.identifiability(still, data, free, guess=oscillation),
@@ -182,10 +208,10 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
     several = hj.fit_model(
         oscillation.system, nothing_fits, free, guess=oscillation, guesses=2
     )
-    assert len(several.guesses) == 2 and several.cost == min(
-        g.cost for g in several.guesses
-    )
-    assert np.ptp([g.values[0] for g in several.guesses]) > 0
+    assert len(several.guesses) == 2
+    assert several.cost == min(g.cost for g in several.guesses)
+    reached = [g.values[0] for g in several.guesses]
+    assert np.ptp(reached) > 0
     one = hj.fit_model(
         oscillation.system, observed(oscillation), free, guess=oscillation, guesses=2
     )
@@ -194,7 +220,8 @@ def test_more_guesses_are_tried_only_where_they_are_needed(oscillation):
 
 @pytest.mark.slow
 def test_data_of_the_hopper_do_not_see_all_parameters(seen_in_htf, seen_in_cycle):
-    assert seen_in_htf.rank == 5 and seen_in_cycle.rank == 6
+    assert seen_in_htf.rank == 5
+    assert seen_in_cycle.rank == 6
     assert sorted(seen_in_htf.descriptions()) == [
         "a common factor of (a, g), only a/g",
         "l0",
@@ -206,11 +233,21 @@ def test_data_of_the_hopper_do_not_see_all_parameters(seen_in_htf, seen_in_cycle
 def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
     hopper_cycle, hopper_htf
 ):
-    u = 0.05 * np.random.default_rng(0).normal(size=(2, 8 * SECTIONS.n_sections, 1))
+    rng = np.random.default_rng(0)
+    pushes = rng.normal(size=(2, 8 * SECTIONS.n_sections, 1))
+    u = 0.05 * pushes
     data = hj.run_experiments(
         hopper_cycle, SECTIONS, u, OUTPUTS, start="cycle", discard=0
     )
-    wrong = hj.models.VerticalHopper(m=1.1, M=1.8, k=11.0, b=4.2, l0=2.2, a=18.0, g=2.2)
+    wrong = hj.models.VerticalHopper(
+        m=1.1,
+        M=1.8,
+        k=11.0,
+        b=4.2,
+        l0=2.2,
+        a=18.0,
+        g=2.2,
+    )
     true = np.array([getattr(hopper_cycle.system, name) for name in HOPPER])
     observed = (
         hj.fitting.ObservedHTF(hopper_htf, SECTIONS),
@@ -220,7 +257,8 @@ def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
         hj.fit_model(wrong, x, HOPPER, guess=hopper_cycle, guesses=4) for x in observed
     )
     np.testing.assert_allclose(by_htf.values[:4], true[:4], rtol=1e-9)  # (not l0)
-    assert by_htf.values[5] / by_htf.values[6] == pytest.approx(10.0, rel=1e-9)
+    ratio = by_htf.values[5] / by_htf.values[6]
+    assert ratio == pytest.approx(10.0, rel=1e-9)
     assert by_series.identifiability.complete
     np.testing.assert_allclose(by_series.values, true, rtol=1e-6)
 
@@ -229,7 +267,8 @@ def test_the_hopper_comes_back_from_its_htfs_and_from_experiments(
 def fitted(hopper_cycle):
     """A fit of a stiffness and both delays, which begins near the cycle of another stiffness."""
     lines = np.arange(1, 33) / 16 + 0.01
-    htf = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081)).htf(lines)
+    delayed = hj.linearize(hopper_cycle, SECTIONS, OUTPUTS, delay=(0.037, 0.081))
+    htf = delayed.htf(lines)
     data = hj.fitting.ObservedHTF(
         htf, SECTIONS, delay=(0.0625, 0.0625)
     )  # (together a whole section)

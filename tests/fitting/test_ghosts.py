@@ -14,7 +14,8 @@ class Ramp(hj.Chart):
     tau: hj.Parameter
 
     def field(self, t, q, u):
-        return ((self.supply - q[0] + u[0]) / self.tau,)
+        rise = self.supply - q[0] + u[0]
+        return (rise / self.tau,)
 
 
 class Trigger(hj.HybridSystem):
@@ -24,13 +25,16 @@ class Trigger(hj.HybridSystem):
     tau: hj.Parameter = hj.parameter(1.0)
 
     def threshold(self, t):
-        return self.base + 1.4 * jnp.sin(2 * jnp.pi * t / 2.2)
+        wave = jnp.sin(2 * jnp.pi * t / 2.2)
+        return self.base + 1.4 * wave
 
     def period(self):
         return 2.2
 
     def charts(self):
-        return {"high": Ramp(12.0, self.tau), "low": Ramp(-12.0, self.tau)}
+        high = Ramp(12.0, self.tau)
+        low = Ramp(-12.0, self.tau)
+        return {"high": high, "low": low}
 
     def transitions(self):
         def top(t, q, u):
@@ -51,7 +55,9 @@ def test_a_fit_that_ends_at_a_cycle_beyond_a_guard_is_not_ok():
     guess = hj.Guess("high", (1.0,))
     sections = hj.ClockPhase(3, 0.35)
     true = hj.find_limit_cycle(Trigger(base=6.1, tau=0.99), guess)
-    htf = hj.linearize(true, sections, ["v"]).htf(np.linspace(0.05, 0.45, 5))
+    f = np.linspace(0.05, 0.45, 5)
+    model = hj.linearize(true, sections, ["v"])
+    htf = model.htf(f)
     observed = hj.fitting.ObservedHTF(htf, sections)
     fit = hj.fit_model(Trigger(), observed, ("base", "tau"), guess=guess)
     assert fit.result == fit.cycle.result == Result.GUARD_BEYOND

@@ -10,7 +10,8 @@ from hybridjax.fitting.model_fit import diagnose
 def blind(rows, residuals=30, seed=0):
     """Sensitivities with a given null space."""
     rows = np.atleast_2d(np.asarray(rows, float))
-    S = np.random.default_rng(seed).normal(size=(residuals, rows.shape[1]))
+    rng = np.random.default_rng(seed)
+    S = rng.normal(size=(residuals, rows.shape[1]))
     return S - S @ np.linalg.pinv(rows) @ rows
 
 
@@ -39,7 +40,8 @@ def test_directions_are_said_in_words(rows, words):
     assert found.rank == 4 - len(rows)
     assert not found.complete
     assert sorted(found.descriptions()) == sorted(words)
-    assert all(f"not identified: {text}" in repr(found) for text in words)
+    for text in words:
+        assert f"not identified: {text}" in repr(found)
 
 
 @given(
@@ -49,11 +51,14 @@ def test_directions_are_said_in_words(rows, words):
 )
 def test_the_basis_spans_what_is_not_seen(rows):
     rows = np.array(rows, float)
-    assume(np.linalg.svd(rows, compute_uv=False)[-1] > 1e-3)
+    sizes = np.linalg.svd(rows, compute_uv=False)
+    assume(sizes[-1] > 1e-3)
     S = blind(rows)
     found = diagnose(tuple("abcde"), S)
     assert found.unseen.shape == rows.shape
-    assert np.abs(S @ found.unseen.T).max() < 1e-2 * np.abs(S).max()
+    left = np.abs(S @ found.unseen.T).max()
+    size = np.abs(S).max()
+    assert left < 1e-2 * size
     assert np.linalg.matrix_rank(np.concatenate([rows, found.unseen]), tol=1e-2) == len(
         rows
     )

@@ -26,13 +26,15 @@ def test_values_come_back_and_keep_to_their_bounds(value, bounds, x):
     values = parameters.read(HOPPER(k=value), ())
     assert_allclose(parameters.decode(parameters.encode(values)), values, rtol=1e-12)
     low, high = (0.0, np.inf) if bounds is None else bounds
-    assert low <= parameters.decode(jnp.array([x]))[0] <= high
+    decoded = parameters.decode(jnp.array([x]))[0]
+    assert low <= decoded <= high
 
 
 def test_a_parameter_keeps_its_sign_by_default():
     system = HOPPER(k=-3.0, b=0.0)
     parameters = free_parameters(system, ("k", "b", "g"))
-    far = parameters.decode(jnp.array([5.0, -5.0, -5.0]))
+    encoded = jnp.array([5.0, -5.0, -5.0])
+    far = parameters.decode(encoded)
     assert far[0] < 0
     assert far[1] == -5.0
     assert far[2] > 0
@@ -46,7 +48,8 @@ TIMES = np.arange(8.0)
 
 
 def records(**options):
-    y = np.random.default_rng(0).normal(size=(2, 16, 1))
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(2, 16, 1))
     y[:, 0] = options.pop("begin", 0.0)
     return hj.experiments.ExperimentData(
         np.zeros((2, 16, 1)), options.pop("y", y), n_sections=8, periods=2, **options

@@ -11,19 +11,27 @@ import hybridjax as hj
 
 def model(A):
     d = A.shape[-1]
-    return hj.linear.LDTP(A, jnp.ones((len(A), d, 1)), jnp.ones((len(A), 1, d)))
+    B = jnp.ones((len(A), d, 1))
+    C = jnp.ones((len(A), 1, d))
+    return hj.linear.LDTP(A, B, C)
 
 
 @settings(max_examples=50)
 @given(st.integers(0, 2**16), st.floats(1e-6, 0.5))
 def test_it_is_bounded_as_stated(seed, smoothing):
-    A = np.random.default_rng(seed).normal(size=(2, 3, 3))
-    values, vectors = np.linalg.eig(A[1] @ A[0])
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(2, 3, 3))
+    product = A[1] @ A[0]
+    values, vectors = np.linalg.eig(product)
     true = np.abs(values).max()
     loss = np.linalg.cond(vectors) ** 2 * smoothing
-    found = float(hj.fitting.spectral_radius(model(jnp.asarray(A)), smoothing))
-    assert found >= true / np.sqrt(1 - smoothing / 3) * (1 - 1e-9)
-    assert loss >= 1 or found <= true / np.sqrt(1 - loss) * (1 + 1e-9)
+    radius = hj.fitting.spectral_radius(model(jnp.asarray(A)), smoothing)
+    found = float(radius)
+    lowest = true / np.sqrt(1 - smoothing / 3)
+    assert found >= lowest * (1 - 1e-9)
+    if loss < 1:
+        largest = true / np.sqrt(1 - loss)
+        assert found <= largest * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
@@ -32,11 +40,15 @@ def test_it_has_a_derivative_where_multipliers_meet(e, mode):
     """Multipliers are 1 +- sqrt(e): at e = 0 their matrix is a Jordan block."""
 
     def radius(e):
-        return hj.fitting.spectral_radius(model(jnp.array([[[1.0, 1.0], [e, 1.0]]])))
+        A = jnp.array([[[1.0, 1.0], [e, 1.0]]])
+        return hj.fitting.spectral_radius(model(A))
 
     h = 1e-6
-    difference = (radius(e + h) - radius(e - h)) / (2 * h)
-    assert float(mode(radius)(e)) == pytest.approx(float(difference), rel=1e-5)
+    later = radius(e + h)
+    change = later - radius(e - h)
+    difference = change / (2 * h)
+    slope = float(mode(radius)(e))
+    assert slope == pytest.approx(float(difference), rel=1e-5)
 
 
 def test_its_derivative_tends_to_that_of_the_radius():
@@ -46,7 +58,9 @@ def test_its_derivative_tends_to_that_of_the_radius():
         c = 0.8 * jnp.cos(1 + 3 * p)
         s = 0.8 * jnp.sin(1 + 3 * p)
         skew = jnp.array([[1.0, 2.0], [0.0, 1.0]])
-        A = (1 + p) * skew @ jnp.array([[c, -s], [s, c]]) @ jnp.linalg.inv(skew)
+        rotation = jnp.array([[c, -s], [s, c]])
+        inverse = jnp.linalg.inv(skew)
+        A = (1 + p) * skew @ rotation @ inverse
         return hj.fitting.spectral_radius(model(A[None]), smoothing)
 
     errors = [

@@ -14,7 +14,9 @@ from hybridjax.errors import ComputationError, DefinitionError
 
 def ball(**numbers):
     def fall(t, q, u, p):
-        return q[1], -p.g - p.drag * jnp.abs(q[1]) * q[1]
+        size = jnp.abs(q[1])
+        drag = p.drag * size * q[1]
+        return q[1], -p.g - drag
 
     def bounce(t, q, u, p):
         return q[0], -p.e * q[1]
@@ -33,21 +35,35 @@ def drop(height):
     """Heights at TIMES and times of two bounces, by scipy."""
 
     def fall(t, q):
-        return q[1], -9.81 - TRUE["drag"] * abs(q[1]) * q[1]
+        size = abs(q[1])
+        drag = TRUE["drag"] * size * q[1]
+        return q[1], -9.81 - drag
 
     def ground(t, q):
         return q[0]
 
     ground.terminal = True
     ground.direction = -1
-    t, q, heights, bounces = 0.0, np.array([height, 0.0]), [], []
+    t = 0.0
+    q = np.array([height, 0.0])
+    heights = []
+    bounces = []
     while t < TIMES[-1]:
-        options = dict(rtol=1e-12, atol=1e-14, method="DOP853", dense_output=True)
+        options = dict(
+            rtol=1e-12,
+            atol=1e-14,
+            method="DOP853",
+            dense_output=True,
+        )
         found = solve_ivp(fall, (t, 1.5), q, events=ground, **options)
-        own = TIMES[(TIMES > t) & (TIMES <= found.t[-1])]
+        is_later = TIMES > t
+        has_come = TIMES <= found.t[-1]
+        own = TIMES[is_later & has_come]
         heights.append(found.sol(own)[0])
         t = found.t[-1]
-        q = np.array([0.0, -TRUE["e"] * found.y[1, -1]])
+        before = found.y[1, -1]
+        speed = -TRUE["e"] * before
+        q = np.array([0.0, speed])
         bounces.append(t)
     return np.concatenate(heights), bounces[:2]
 
@@ -56,7 +72,8 @@ def observed(height, seed=None, **options):
     y, bounces = drop(height)
     y = y[:, None].copy()
     if seed is not None:
-        y += 0.003 * np.random.default_rng(seed).normal(size=y.shape)
+        draws = np.random.default_rng(seed).normal(size=y.shape)
+        y += 0.003 * draws
         options["std"] = 0.003
     y[7] = np.nan  # (a frame without the ball)
     begin = hj.Guess("main", (height + 0.02, 0.1))
@@ -73,8 +90,10 @@ def test_parameters_and_starts_of_two_drops_are_those_of_scipy():
         "y at start 2",
         "v at start 2",
     )
-    assert_allclose(fit.values, (*TRUE.values(), 1.0, 0.0, 1.5, 0.0), atol=1e-6)
-    assert len(fit.residuals) == 2 * (len(TIMES) - 1)
+    expected = (*TRUE.values(), 1.0, 0.0, 1.5, 0.0)
+    assert_allclose(fit.values, expected, atol=1e-6)
+    measured = 2 * (len(TIMES) - 1)
+    assert len(fit.residuals) == measured
     assert fit.cycle is None
     assert_allclose(float(fit.system.e), TRUE["e"], atol=1e-6)
 
@@ -102,7 +121,8 @@ def test_values_of_one_output_need_no_second_axis():
 def test_prints_have_the_digits_that_errors_leave():
     data = observed(1.0, seed=0)
     assert " known=" not in repr(data)  # (It would list the place of each sample.)
-    table = repr(hj.fit_model(ball(), data, ("e", "drag")))
+    fit_of_ball = hj.fit_model(ball(), data, ("e", "drag"))
+    table = repr(fit_of_ball)
     assert re.search(r"e  +0\.\d{4} +± 0\.00\d\d\n", table)
 
 
@@ -110,11 +130,14 @@ def test_prints_have_the_digits_that_errors_leave():
 def test_standard_errors_are_those_of_many_draws():
     errors = []
     for seed in range(60):
-        fit = hj.fit_model(ball(), observed(1.0, seed), ("e", "drag"))
+        data = observed(1.0, seed)
+        fit = hj.fit_model(ball(), data, ("e", "drag"))
         size = fit.standard_errors[:2]
-        errors.append((fit.values[:2] - tuple(TRUE.values())) / size)
+        true = tuple(TRUE.values())
+        errors.append((fit.values[:2] - true) / size)
     spread = np.std(errors, axis=0)
-    assert (0.75 < spread).all() and (spread < 1.3).all()
+    assert (0.75 < spread).all()
+    assert (spread < 1.3).all()
 
 
 @pytest.mark.parametrize(

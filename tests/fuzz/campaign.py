@@ -51,7 +51,8 @@ class Report:
 
     @property
     def compared(self) -> int:
-        return self.systems - sum(len(numbers) for numbers in self.excluded.values())
+        excluded = sum(len(numbers) for numbers in self.excluded.values())
+        return self.systems - excluded
 
     def __str__(self):
         lines = [
@@ -89,9 +90,11 @@ def check(name: str, numbers, seed: int = 0, accuracy: float = ACCURACY) -> Repo
         report.events += len(run.events)
         full = len(run.events) == EVENTS
         if result != hj.errors.Result.OK:
-            report.failures[k] = f"{result.name} at t = {trial.t:.9g}"
+            place = f"{result.name} at t = {trial.t:.9g}"
+            report.failures[k] = place
         elif order(trial) != order(run):
-            report.failures[k] = f"events {order(trial)}, but {order(run)} by scipy"
+            orders = f"events {order(trial)}, but {order(run)} by scipy"
+            report.failures[k] = orders
         else:
             error = difference(trial, run, end=not full)
             report.error = tuple(map(max, report.error, error))
@@ -118,7 +121,9 @@ def truth(plan: Plan, sample: Sample) -> Run:
 
 def stop(run: Run, sample: Sample) -> float:
     """When hybridjax may stop: at the limit, or a little after the last event."""
-    return sample.start.limit if len(run.events) < EVENTS else run.t + 1e-3
+    if len(run.events) < EVENTS:
+        return sample.start.limit
+    return run.t + 1e-3
 
 
 def order(run: Run) -> list[int]:
@@ -129,13 +134,17 @@ def difference(a: Run, b: Run, end: bool) -> tuple[float, float]:
     """Largest differences of times and states, relative to 1 + their size."""
 
     def relative(x, y):
-        return np.max(np.abs(x - y) / (1 + np.abs(y)))
+        size = 1 + np.abs(y)
+        return np.max(np.abs(x - y) / size)
 
     pairs = list(zip(a.events, b.events, strict=True))
     times = [relative(x.t, y.t) for x, y in pairs]
     states = [relative(x.after, y.after) for x, y in pairs]
     if end:
-        states.append(relative(a.q, b.q) if a.chart == b.chart else np.inf)
+        if a.chart == b.chart:
+            states.append(relative(a.q, b.q))
+        else:
+            states.append(np.inf)
     return max(times, default=0.0), max(states, default=0.0)
 
 
@@ -149,12 +158,15 @@ def engine(
     out = []
     for k in range(0, len(samples), BATCH):
         piece = samples[k : k + BATCH]
-        fill = piece + piece[-1:] * (BATCH - len(piece))
-        stops = ends[k : k + BATCH] + ends[-1:] * (BATCH - len(piece))
+        missing = BATCH - len(piece)
+        fill = piece + piece[-1:] * missing
+        no_more = ends[-1:] * (BATCH - len(piece))
+        stops = ends[k : k + BATCH] + no_more
         many = jax.tree_util.tree_map(
             lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *fill
         )
-        moved = _flow(plan, many, jnp.asarray(stops), jnp.asarray(accuracy))
+        times = jnp.asarray(stops)
+        moved = _flow(plan, many, times, jnp.asarray(accuracy))
         moved = jax.tree_util.tree_map(np.asarray, moved)
         for i in range(len(piece)):
             result, count, events, t, chart, q = jax.tree_util.tree_map(
@@ -164,7 +176,9 @@ def engine(
                 Event(float(at), int(code), int(b), after[: plan.dims[b]])
                 for at, code, b, after in zip(*events, strict=True)
             ]
-            run = Run(events[:count], float(t), int(chart), q[: plan.dims[chart]])
+            state = q[: plan.dims[chart]]
+            happened = events[:count]
+            run = Run(happened, float(t), int(chart), state)
             out.append((hj.errors.Result(int(result)), run))
     return out
 
@@ -174,9 +188,12 @@ def _flow(plan: Plan, many: Sample, ends, accuracy):
     def one(sample: Sample, end):
         t, q, u, _ = sample.start
         s = Structure(Random(plan, sample.charts, sample.arrows))
-        q = jnp.zeros((s.d, 1)).at[: plan.dims[0], 0].set(q)
+        padded = jnp.zeros((s.d, 1))
+        d = plan.dims[0]
+        q = padded.at[:d, 0].set(q)
         settings = Settings(rtol=accuracy, atol=accuracy, max_steps=STEPS)
-        lanes = start_lanes(s, t[None], jnp.zeros(1, jnp.int32), q)
+        charts = jnp.zeros(1, jnp.int32)
+        lanes = start_lanes(s, t[None], charts, q)
         moved, tape = move(
             s, lanes, u[:, None], until(end[None]), settings, options=Options(True)
         )

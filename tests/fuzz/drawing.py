@@ -38,7 +38,8 @@ def swinging(rng, n: int, rate=(0.8, 2.5), damping=(0.0, 0.1)) -> dict[str, Any]
         A[k : k + 2, k : k + 2] = [[-z, w], [-w, -z]]
     if n % 2:
         A[-1, -1] = -rng.uniform(0.2, 1.0)
-    basis = np.linalg.qr(rng.normal(size=(n, n)))[0] * rng.uniform(0.7, 1.4, n)
+    rotation = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    basis = rotation * rng.uniform(0.7, 1.4, n)
     mild = float(rng.random() < 0.5)
     return still(
         n,
@@ -75,7 +76,9 @@ def drifting(rng, n: int, direction: float) -> dict[str, Any]:
 
 def arrow(rng, n: int, after: int, /, spread=0.3, **given) -> dict[str, Any]:
     """A flat guard near zero, and a reset that turns and stretches the state and moves it."""
-    turn = np.linalg.qr(rng.normal(size=(max(n, after),) * 2))[0][:after, :n]
+    larger = max(n, after)
+    turn, _ = np.linalg.qr(rng.normal(size=(larger, larger)))
+    turn = turn[:after, :n]
     normal = rng.normal(size=n)
     numbers = {
         "n": normal / np.linalg.norm(normal),
@@ -98,7 +101,8 @@ def arrow(rng, n: int, after: int, /, spread=0.3, **given) -> dict[str, Any]:
 
 def start(rng, n: int, limit=25.0, size=1.2) -> Start:
     t = rng.uniform(0.0, 5.0)
-    return Start(t, rng.normal(0.0, size, n), rng.normal(size=2), t + limit)
+    state = rng.normal(0.0, size, n)
+    return Start(t, state, rng.normal(size=2), t + limit)
 
 
 def unit(n: int, k: int = 0) -> np.ndarray:
@@ -116,7 +120,9 @@ def wave(rng, size, rate) -> dict[str, Any]:
 
 def beside(rng, x, sign: float) -> dict[str, Any]:
     """A curved guard that crosses shortly before or after the flat guard of the arrow `x`."""
-    gap = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-5.5, -1.5)
+    side = rng.choice([-1.0, 1.0])
+    exponent = rng.uniform(-5.5, -1.5)
+    gap = side * 10**exponent
     bend = rng.normal(0.0, 3.0)
     # sign * (n.q + c + gap + bend * (n.q + c)^2)
     n = x["n"]
@@ -134,7 +140,8 @@ STRUCTURES: dict[str, tuple[Plan, Callable[[np.random.Generator], Sample]]] = {}
 
 def structure(*arrows, dims):
     """List a function that draws systems of this plan."""
-    plan = Plan(dims, tuple(Arrow(*a) for a in arrows))
+    all_arrows = tuple(Arrow(*a) for a in arrows)
+    plan = Plan(dims, all_arrows)
     return lambda function: STRUCTURES.setdefault(function.__name__, (plan, function))[
         1
     ]
@@ -149,7 +156,9 @@ def kicks(rng) -> Sample:
     arrows = [arrow(rng, 3, 3, m=np.zeros(2), V=np.zeros((3, 2))) for _ in range(3)]
     for x in arrows:
         if rng.random() < 0.5:
-            x |= {"R": np.eye(3), "r": x["r"] - x["n"] * (x["n"] @ x["r"])}
+            along = x["n"] @ x["r"]
+            kept = x["r"] - x["n"] * along
+            x |= {"R": np.eye(3), "r": kept}
     return Sample([swinging(rng, 3)], arrows, start(rng, 3))
 
 
@@ -179,9 +188,12 @@ def hop(rng) -> Sample:
     the systems where touchdown's guard is zero."""
     air = swinging(rng, 4)
     ground = swinging(rng, 2)
-    land = arrow(rng, 4, 2, n=unit(4, 2), R=np.eye(4)[:2], r=rng.normal(0.0, 0.1, 2))
+    upper = np.eye(4)[:2]
+    land = arrow(rng, 4, 2, n=unit(4, 2), R=upper, r=rng.normal(0.0, 0.1, 2))
     land |= {"c": 0.0, "m": np.zeros(2)}
-    lift = arrow(rng, 2, 4, R=np.eye(4)[:, :2], V=np.zeros((4, 2)))
+    left = np.eye(4)[:, :2]
+    none = np.zeros((4, 2))
+    lift = arrow(rng, 2, 4, R=left, V=none)
     if rng.random() < 0.5:  # start right on the guard of touchdown
         lift["r"][2] = 0.0
     return Sample([air, ground], [land, lift], start(rng, 4))
@@ -195,10 +207,21 @@ def ladder(rng) -> Sample:
     for n, after, level in ((1, 3, 1.0), (3, 5, -1.0), (5, 1, 1.0)):
         back = np.zeros((after, n))
         back[0, 0] = rng.uniform(-0.5, 0.5)
-        back[1:, :] = rng.normal(0.0, 0.5, (after - 1, n))
+        spread = rng.normal(0.0, 0.5, (after - 1, n))
+        back[1:, :] = spread
         c = -level * rng.uniform(0.5, 1.5)
         offset = rng.normal(0.0, 0.3, after)
-        arrows.append(arrow(rng, n, after, n=unit(n), c=c, R=back, r=offset))
+        arrows.append(
+            arrow(
+                rng,
+                n,
+                after,
+                n=unit(n),
+                c=c,
+                R=back,
+                r=offset,
+            )
+        )
     return Sample(charts, arrows, start(rng, 1, size=0.3))
 
 
@@ -235,7 +258,8 @@ def switch(rng) -> Sample:
         ),
         arrow(rng, 2, 2),
     ]
-    return Sample([swinging(rng, 2), swinging(rng, 2)], arrows, start(rng, 2))
+    charts = [swinging(rng, 2), swinging(rng, 2)]
+    return Sample(charts, arrows, start(rng, 2))
 
 
 @structure(
@@ -289,4 +313,6 @@ def draw(name: str, number: int, seed: int = 0) -> Sample:
     """System `number` of a structure."""
     # (So that "dips:28" stays the system that failed once.)
     place = 2 + list(STRUCTURES).index(name)
-    return STRUCTURES[name][1](np.random.default_rng([seed, place, number]))
+    rng = np.random.default_rng([seed, place, number])
+    _, draw_sample = STRUCTURES[name]
+    return draw_sample(rng)

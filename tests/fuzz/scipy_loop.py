@@ -52,13 +52,16 @@ def run(plan: Plan, sample: Sample, events: int, rtol: float, atol: float) -> Ru
     chart = 0
     excluded = None
     while len(found) < events and t < limit:
-        stay = _Stay(plan, sample, chart, t, np.asarray(q, float), u)
+        state = np.asarray(q, float)
+        stay = _Stay(plan, sample, chart, t, state, u)
         t, q, code, reason = stay.follow(limit, rtol, atol)
         excluded = excluded or reason
         if code is None:
             break
         x = sample.arrows[code]
-        q = x["R"] @ q + x["r"] + x["V"] @ u
+        kept = x["R"] @ q
+        pushed = x["V"] @ u
+        q = kept + x["r"] + pushed
         chart = plan.arrows[code].target
         if found and t - found[-1].t < CLOSE:
             excluded = excluded or "events too close"
@@ -88,25 +91,35 @@ class _Stay:
 
     def field(self, t, q):
         x = self.x
-        smooth = x["A"] @ q + x["b"] + x["B"] @ self.u - x["cube"] * q**3
-        bounded = x["S"] @ np.sin(q) + x["T"] @ np.tanh(q)
-        wave = x["a"] * np.sin(x["w"] * t + x["p"])
+        linear = x["A"] @ q + x["b"]
+        cubic = x["cube"] * q**3
+        smooth = linear + x["B"] @ self.u - cubic
+        swing = x["S"] @ np.sin(q)
+        bounded = swing + x["T"] @ np.tanh(q)
+        phase = x["w"] * t + x["p"]
+        wave = x["a"] * np.sin(phase)
         return smooth + bounded + wave
 
     def guard(self, g, t, q):
         """Guard g at one state, or at states (n, m), signed so that it falls at its event."""
         x = self.arrows[g]
-        wave = x["a"] * np.sin(x["w"] * t + x["p"])
-        flat = x["n"] @ q + x["c"] + x["m"] @ self.u + wave
-        curved = 0.5 * np.sum(q * (x["Q"] @ q), axis=0)
+        phase = x["w"] * t + x["p"]
+        wave = x["a"] * np.sin(phase)
+        along = x["n"] @ q + x["c"]
+        flat = along + x["m"] @ self.u + wave
+        bent = q * (x["Q"] @ q)
+        curved = 0.5 * np.sum(bent, axis=0)
         value = flat + curved
         return value if self.plan.arrows[g].kind == "falling" else -value
 
     def rate(self, g, t, q):
         """Time derivative of `guard` at one state."""
         x = self.arrows[g]
-        slope = x["n"] + 0.5 * (x["Q"] + x["Q"].T) @ q
-        wave = x["a"] * x["w"] * np.cos(x["w"] * t + x["p"])
+        symmetric = x["Q"] + x["Q"].T
+        slope = x["n"] + 0.5 * symmetric @ q
+        phase = x["w"] * t + x["p"]
+        slope_of_wave = x["a"] * x["w"]
+        wave = slope_of_wave * np.cos(phase)
         rate = slope @ self.field(t, q) + wave
         return rate if self.plan.arrows[g].kind == "falling" else -rate
 
@@ -122,7 +135,8 @@ class _Stay:
         for g in self.clocks:
             period = self.arrows[g]["period"]
             offset = self.arrows[g]["offset"]
-            k = np.floor((self.t - offset) / period + 1e-9) + 1
+            passed = (self.t - offset) / period
+            k = np.floor(passed + 1e-9) + 1
             times.append((offset + k * period, g))
         return min(times, default=(np.inf, None))
 
@@ -163,7 +177,9 @@ class _Stay:
     def with_minima(self, value, t, v):
         """Samples, and the minima below zero between them."""
         inner = v[1:-1]
-        is_dip = (inner > 0) & (inner <= v[:-2]) & (inner <= v[2:])
+        below_last = inner <= v[:-2]
+        below_next = inner <= v[2:]
+        is_dip = (inner > 0) & below_last & below_next
         for k in np.flatnonzero(is_dip)[::-1] + 1:
             low = minimize_scalar(
                 value,
@@ -183,9 +199,12 @@ class _Stay:
         def value(time):
             return self.guard(g, time, dense(time))
 
-        t, v = self.with_minima(value, t, self.guard(g, t, q))
-        rates = np.abs(np.diff(v) / np.diff(t))
-        self.fastest[g] = max(self.fastest[g], rates.max())
+        values = self.guard(g, t, q)
+        t, v = self.with_minima(value, t, values)
+        steps = np.diff(v) / np.diff(t)
+        rates = np.abs(steps)
+        fastest = rates.max()
+        self.fastest[g] = max(self.fastest[g], fastest)
         found = []
         for k in range(1, len(t)):
             self.armed[g] |= v[k - 1] > LEFT

@@ -63,9 +63,13 @@ class Piece(hj.Chart):
 
     def field(self, t, q, u):
         x = self.x
-        smooth = x["A"] @ q + x["b"] + x["B"] @ u - x["cube"] * q**3
-        bounded = x["S"] @ jnp.sin(q) + x["T"] @ jnp.tanh(q)
-        return smooth + bounded + x["a"] * jnp.sin(x["w"] * t + x["p"])
+        linear = x["A"] @ q + x["b"]
+        cubic = x["cube"] * q**3
+        smooth = linear + x["B"] @ u - cubic
+        swing = x["S"] @ jnp.sin(q)
+        bounded = swing + x["T"] @ jnp.tanh(q)
+        phase = x["w"] * t + x["p"]
+        return smooth + bounded + x["a"] * jnp.sin(phase)
 
 
 class Random(hj.HybridSystem):
@@ -94,14 +98,20 @@ class Random(hj.HybridSystem):
 
     def _transition(self, g, arrow: Arrow, x):
         def guard(t, q, u):
-            curved = x["n"] @ q + 0.5 * q @ (x["Q"] @ q) + x["c"]
-            return curved + x["m"] @ u + x["a"] * jnp.sin(x["w"] * t + x["p"])
+            bent = 0.5 * q @ (x["Q"] @ q)
+            along = x["n"] @ q
+            curved = along + bent + x["c"]
+            phase = x["w"] * t + x["p"]
+            wave = x["a"] * jnp.sin(phase)
+            return curved + x["m"] @ u + wave
 
         def enabled(t, q, u):
             return x["k"] @ q + x["k0"] > 0
 
         def reset(t, q, u):
-            return x["R"] @ q + x["r"] + x["V"] @ u
+            kept = x["R"] @ q
+            pushed = x["V"] @ u
+            return kept + x["r"] + pushed
 
         by_clock = arrow.kind == "scheduled"
         return hj.Transition(

@@ -40,7 +40,8 @@ def rounded(level):
     grow with the state and with time."""
 
     def guard(t, q, u):
-        return q[0] + 1.1 * q[1] + 0.1 * jnp.sin(2 * jnp.pi * t) - level
+        wave = 0.1 * jnp.sin(2 * jnp.pi * t)
+        return q[0] + 1.1 * q[1] + wave - level
 
     def line_rates(t, q, u):
         return (-1.0, -1.0)
@@ -58,7 +59,9 @@ def test_a_guard_that_the_input_makes_negative_is_not_armed():
 def two_pieces(x, first, second):
     """One second at one input, and one at another."""
     s = Structure(THRESHOLD)
-    lanes = start_lanes(s, jnp.zeros(1), jnp.zeros(1, jnp.int32), jnp.full((1, 1), x))
+    none = jnp.zeros(1, jnp.int32)
+    state = jnp.full((1, 1), x)
+    lanes = start_lanes(s, jnp.zeros(1), none, state)
     h = None
     for end, u in ((1.0, first), (2.0, second)):
         moved = move(
@@ -66,18 +69,21 @@ def two_pieces(x, first, second):
         ).moved
         lanes = moved.lanes
         h = moved.h
-    return hj.errors.Result(int(moved.result[0])), int(lanes.events[0])
+    code = int(moved.result[0])
+    return hj.errors.Result(code), int(lanes.events[0])
 
 
 def test_a_guard_that_a_new_input_makes_positive_is_armed():
-    assert two_pieces(-0.5, 0.0, 1.6) == (hj.errors.Result.OK, 1)
+    found = two_pieces(-0.5, 0.0, 1.6)
+    assert found == (hj.errors.Result.OK, 1)
 
 
 @pytest.mark.parametrize("size, time", [(1e4, 0.0), (1.0, 3e3)])
 def test_an_event_that_leaves_its_guard_at_zero_up_to_rounding_happens_once(size, time):
     """100 systems with other levels: they differ by how their guards are rounded."""
     duration = 1 / 32
-    result, events = across(size * jnp.linspace(0.5, 2.0, 100), time, duration)
+    sizes = size * jnp.linspace(0.5, 2.0, 100)
+    result, events = across(sizes, time, duration)
     assert_array_equal(result, hj.errors.Result.OK)
     assert_array_equal(events, 1)
 
@@ -89,8 +95,13 @@ def across(x, time, duration):
     t = jnp.full(1, time)
     q = jnp.stack([x, -x])[:, None]
     hit = duration / 3
-    level = -0.1 * x - 2.1 * hit + 0.1 * jnp.sin(2 * jnp.pi * (time + hit))
+    angle = 2 * jnp.pi * (time + hit)
+    wave = jnp.sin(angle)
+    level = -0.1 * x - 2.1 * hit + 0.1 * wave
     s = Structure(Toys(rounded, [level]))
-    lanes = start_lanes(s, t, jnp.zeros(1, jnp.int32), q)
-    moved = move(s, lanes, jnp.zeros((1, 1)), until(t + duration), SETTINGS).moved
+    none = jnp.zeros(1, jnp.int32)
+    lanes = start_lanes(s, t, none, q)
+    no_input = jnp.zeros((1, 1))
+    target = until(t + duration)
+    moved = move(s, lanes, no_input, target, SETTINGS).moved
     return moved.result[0], moved.lanes.events[0]

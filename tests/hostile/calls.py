@@ -36,10 +36,23 @@ def systems(t):
     def flow(time, q, u):
         return q[0]
 
-    yield hj.Guess, dict(chart="plane", state=(1.0, 0.0), time=0.0, after="hit")
+    yield (
+        hj.Guess,
+        dict(
+            chart="plane",
+            state=(1.0, 0.0),
+            time=0.0,
+            after="hit",
+        ),
+    )
     yield hj.Output, dict(name="z", function=flow)
     yield hj.Output("z", flow).in_chart, dict(name="plane")
-    ends = dict(name="hit", source="flow", target="flow", guard=flow)
+    ends = dict(
+        name="hit",
+        source="flow",
+        target="flow",
+        guard=flow,
+    )
     yield hj.Transition, ends | dict(direction="falling", reset=flow)
     yield hj.systems.Scheduled, dict(period=1.0, offset=0.0)
     yield hj.parameter, dict(default=1.0)
@@ -48,11 +61,29 @@ def systems(t):
     yield hj.scale.enable_progress, dict(enabled=False)
     yield hj.scale.enable_compilation_cache, dict(folder=None)
     yield hj.orbits.Settings, dict(rtol=1e-09, atol=1e-09)
-    begin = dict(chart="plane", state=(1.0, 0.0), duration=0.1, time=0.0)
+    begin = dict(
+        chart="plane",
+        state=(1.0, 0.0),
+        duration=0.1,
+        time=0.0,
+    )
     yield hj.simulate, dict(system=t.system) | begin
     guess = hj.Guess("plane", (1.0, 0.0))
-    yield hj.flow, dict(system=t.system, start=guess, until=0.1, max_events=2)
-    samples = dict(times=(0.1, 0.2), outputs="x", values=[[1.0], [2.0]], std=0.1)
+    yield (
+        hj.flow,
+        dict(
+            system=t.system,
+            start=guess,
+            until=0.1,
+            max_events=2,
+        ),
+    )
+    samples = dict(
+        times=(0.1, 0.2),
+        outputs="x",
+        values=[[1.0], [2.0]],
+        std=0.1,
+    )
     yield hj.fitting.ObservedTrajectory, dict(start=guess) | samples
 
 
@@ -68,7 +99,15 @@ def sections(t):
     yield hj.sections.place_sections, dict(cycle=t.cycle, sections=PHASE)
     yield t.placed.observe, dict(outputs=STATES)
     yield hj.linearize, dict(cycle=t.cycle, sections=t.placed, outputs=STATES)
-    yield hj.sections.section_map, dict(cycle=t.cycle, sections=t.placed, i=0, j=1)
+    yield (
+        hj.sections.section_map,
+        dict(
+            cycle=t.cycle,
+            sections=t.placed,
+            i=0,
+            j=1,
+        ),
+    )
     yield t.map, dict(q=t.map.fixed_point)
 
 
@@ -78,7 +117,12 @@ def cycles(t):
     yield t.cycles.__getitem__, dict(i=0)
     yield (
         hj.continuation,
-        dict(cycle=t.cycle, parameter="mu", range=(0.1, 0.2), step=0.05),
+        dict(
+            cycle=t.cycle,
+            parameter="mu",
+            range=(0.1, 0.2),
+            step=0.05,
+        ),
     )
     yield t.cycle.responses, dict(modes=0)
     yield (
@@ -98,9 +142,26 @@ def linear(t):
     B = np.asarray(t.model.B)
     C = np.asarray(t.model.C)
     D = np.asarray(t.model.D)
-    yield hj.linear.LDTP, dict(A=A, B=B, C=C, D=D, dims=np.asarray(t.model.dims))
+    yield (
+        hj.linear.LDTP,
+        dict(
+            A=A,
+            B=B,
+            C=C,
+            D=D,
+            dims=np.asarray(t.model.dims),
+        ),
+    )
     square = [np.eye(2)] * 3
-    yield hj.linear.LDTP.from_blocks, dict(A=square, B=square, C=square, D=square)
+    yield (
+        hj.linear.LDTP.from_blocks,
+        dict(
+            A=square,
+            B=square,
+            C=square,
+            D=square,
+        ),
+    )
     u = np.ones((12, 2))
     for name in ("states", "simulate"):
         yield getattr(t.model, name), dict(u=u)
@@ -112,6 +173,9 @@ def linear(t):
         t.model.feedback,
         dict(controller=np.zeros((len(t.model.inputs), len(t.model.outputs)))),
     )
+
+
+def transfer_functions(t):
     f = np.asarray(t.estimate.frequencies)
     H = np.asarray(t.estimate.H)
     size = np.ones(H.shape)
@@ -123,7 +187,13 @@ def linear(t):
     )
     yield (
         hj.linear.HTF,
-        dict(frequencies=f, H=H, harmonics=(-1, 0, 1), n_sections=6) | errors,
+        dict(
+            frequencies=f,
+            H=H,
+            harmonics=(-1, 0, 1),
+            n_sections=6,
+        )
+        | errors,
     )
     yield hj.linear.VarianceDof, dict(dof=f, roundness=size)
     yield variance_dof.quantile, dict(level=0.9)
@@ -139,17 +209,27 @@ def linear(t):
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
     yield htf.select, dict(harmonics=0)
-    yield htf.predict, dict(u=u)
+    yield htf.predict, dict(u=np.ones((12, 2)))
     for name in ("error", "harmonic_errors"):
         yield getattr(htf, name), dict(other=t.exact)
 
 
 def designs(t):
-    lines = dict(n_sections=6, periods=16, frequencies=(0.0, 3.0), amplitude=0.01)
+    lines = dict(
+        n_sections=6,
+        periods=16,
+        frequencies=(0.0, 3.0),
+        amplitude=0.01,
+    )
     yield hj.multisine, lines | dict(experiments=8, inputs=1)
     yield (
         hj.experiments.paper_design,
-        dict(n_sections=20, periods=16, experiments=40, division="random"),
+        dict(
+            n_sections=20,
+            periods=16,
+            experiments=40,
+            division="random",
+        ),
     )
     cosines = dict(frequencies=[[0.25], [0.5]], amplitudes=0.01, phases=0.0)
     yield hj.experiments.Design.from_lines, cosines | dict(n_sections=6, periods=16)
@@ -163,10 +243,21 @@ def designs(t):
 
 
 def experiments(t):
-    to_run = dict(cycle=t.cycle, sections=t.placed, design=t.one_input, outputs=STATES)
+    to_run = dict(
+        cycle=t.cycle,
+        sections=t.placed,
+        design=t.one_input,
+        outputs=STATES,
+    )
     yield hj.run_experiments, to_run
     small = hj.multisine(4, periods=16, amplitude=1e-4)
-    whole = dict(system=t.cycle, sections=PHASE, outputs="x", order=1, design=small)
+    whole = dict(
+        system=t.cycle,
+        sections=PHASE,
+        outputs="x",
+        order=1,
+        design=small,
+    )
     yield hj.identify_model, whole
     yield hj.experiments.StoredExperiments, dict(store="nope")
     yield (
@@ -178,7 +269,15 @@ def experiments(t):
     yield hj.experiments.ProcessNoise, dict(std=0.1)
     yield hj.experiments.add_noise, dict(data=t.data, std=0.1)
     y = np.ones(t.data.y.shape)
-    yield hj.experiments.ExperimentData, dict(u=t.data.u, y=y, n_sections=6, periods=16)
+    yield (
+        hj.experiments.ExperimentData,
+        dict(
+            u=t.data.u,
+            y=y,
+            n_sections=6,
+            periods=16,
+        ),
+    )
     one = t.record
     yield hj.experiments.SectionSeries, dict(u=one.u, y=one.y, n_sections=6)
     yield one.part, dict(first=0, stop=12)
@@ -219,7 +318,12 @@ def series(t):
 
 
 def fitting(t):
-    both = dict(system=t.system, data=t.observed, free=("mu",), guess=t.cycle)
+    both = dict(
+        system=t.system,
+        data=t.observed,
+        free=("mu",),
+        guess=t.cycle,
+    )
     yield hj.fit_model, both
     yield hj.fitting.identifiability, both
     yield hj.fitting.spectral_radius, dict(model=t.model)
@@ -298,7 +402,12 @@ def recordings(t):
     yield t.found.responses.of_model, dict(model=t.model)
     yield (
         without_drift,
-        dict(recording=t.recording, phase=t.phase, signals="x", cycles=5.0),
+        dict(
+            recording=t.recording,
+            phase=t.phase,
+            signals="x",
+            cycles=5.0,
+        ),
     )
     table = dict(recording=t.recording, phase=t.phase, path="nope.csv")
     yield hj.recordings.attach_design, table
@@ -314,7 +423,15 @@ def subjects(t):
         yield call, dict(quantity="m")
     two = dict(a="old", b="new")
     yield population.difference, dict(quantity="m") | two
-    yield population.power, dict(quantity="m", difference=0.1, subjects=(4,), draws=2)
+    yield (
+        population.power,
+        dict(
+            quantity="m",
+            difference=0.1,
+            subjects=(4,),
+            draws=2,
+        ),
+    )
     yield maps.mean, dict(label="old")
     yield maps.difference, two
     yield population.plot, dict(quantity="m")
@@ -344,7 +461,12 @@ def testing(t):
     force = np.zeros((1, 50, 1))
     yield (
         hj.testing.simulate_recording,
-        dict(cycle=t.cycle, force=force, outputs=STATES, rate=16),
+        dict(
+            cycle=t.cycle,
+            force=force,
+            outputs=STATES,
+            rate=16,
+        ),
     )
 
 
@@ -446,6 +568,7 @@ PARTS = (
     sections,
     cycles,
     linear,
+    transfer_functions,
     designs,
     experiments,
     estimates,

@@ -169,7 +169,8 @@ def attempt(function, good: dict, name: str, value) -> str:
     except Exception as error:
         if isinstance(error, IndexError) and function.__name__ == "__getitem__":
             return ""  # by which iteration ends
-        return f"FOREIGN: {type(error).__name__}: {error}"[:200]
+        text = f"FOREIGN: {type(error).__name__}: {error}"
+        return text[:200]
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         pyplot.close("all")
@@ -253,7 +254,8 @@ def main() -> None:
                     wrong[name].append(shown)
                     print(name, shown, file=sys.stderr, flush=True)
                 turn += 1
-        left = sorted(path.name for path in pathlib.Path(folder).iterdir())
+        entries = pathlib.Path(folder).iterdir()
+        left = sorted(path.name for path in entries)
         os.chdir(home)
     print(json.dumps({"calls": wrong, "files": left}, indent=1))
 

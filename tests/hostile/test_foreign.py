@@ -81,7 +81,8 @@ def test_solvers(solver):
 
 
 def test_sweeps_of_systems_without_parameters():
-    cycle = hj.find_limit_cycle(Neuron(), hj.Guess("below", (0.5,)))
+    guess = hj.Guess("below", (0.5,))
+    cycle = hj.find_limit_cycle(Neuron(), guess)
     for systems in ([Neuron(), Neuron()], Neuron()):
         refused(
             "Neuron has no parameters",
@@ -104,14 +105,17 @@ def test_names_that_no_file_can_have(tmp_path):
 def test_bandwidths_and_drifts_beyond_all_records():
     time = np.arange(4000) / 100
     x = 1 + np.sin(2 * np.pi * time)
-    recording = hj.Recording(time, {"x": x + 0.01 * time})
-    phase = hj.recordings.estimate_phase(recording, hj.Crossing("x", "rising", 1.2))
+    drifting = x + 0.01 * time
+    recording = hj.Recording(time, {"x": drifting})
+    crossing = hj.Crossing("x", "rising", 1.2)
+    phase = hj.recordings.estimate_phase(recording, crossing)
     flat = [
         without_drift(recording, phase, "x", cycles).trials[0].values
         for cycles in (1e9, 1e300)
     ]
     assert_allclose(*flat, rtol=1e-6)  # a straight line is left out
-    slopes = (np.polyfit(time, values, 1)[0] for values in (flat[1][:, 0], x))
+    sides = (flat[1][:, 0], x)
+    slopes = (np.polyfit(time, values, 1)[0] for values in sides)
     assert_allclose(*slopes, atol=2e-4)
     refused(
         "`drift` must be two cycles or more",
@@ -127,7 +131,8 @@ def test_settings_of_jax_for_the_lines_of_users():
     def results():
         cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
         model = hj.linearize(cycle, hj.ClockPhase(4), outputs="yM")
-        design = hj.multisine(4, 8, (0, 1.9)).scaled(0.001)
+        whole = hj.multisine(4, 8, (0, 1.9))
+        design = whole.scaled(0.001)
         data = hj.run_experiments(cycle, hj.ClockPhase(4), design, "yM")
         estimate = hj.estimate_htf(data, harmonics=0)
         print(cycle, model, data.summary())

@@ -71,7 +71,8 @@ def outcome():
 
 
 def test_hostile_calls_are_refused_in_one_sentence(outcome):
-    assert not {name: wrong for name, wrong in outcome["calls"].items() if wrong}
+    wrong_calls = {name: wrong for name, wrong in outcome["calls"].items() if wrong}
+    assert not wrong_calls
 
 
 def test_hostile_calls_write_nothing(outcome):

@@ -39,7 +39,8 @@ def record(t):
 
 def run(t, u):
     y = np.stack([t.model.simulate(x) for x in u])
-    noise = 1e-3 * np.random.default_rng(2).normal(size=y.shape)
+    draws = np.random.default_rng(2).normal(size=y.shape)
+    noise = 1e-3 * draws
     return hj.experiments.ExperimentData(u, y + noise, n_sections=6, periods=16)
 
 
@@ -47,7 +48,8 @@ def recording(t):
     """Sixty turns that a force disturbs a little, by the law of an oscillator."""
     z = [1.0 + 0j]
     rng = np.random.default_rng(0)
-    force = rng.normal(size=121).repeat(20)[: len(TIME)]
+    draws = rng.normal(size=121)
+    force = draws.repeat(20)[: len(TIME)]
     for f in force[:-1]:
         z.append(
             z[-1] * np.exp(2j * np.pi * TIME[1] + 0.01 * (1 - abs(z[-1]) ** 2))
@@ -67,7 +69,8 @@ def branch(t):
         BranchEnd(mu, hj.errors.Result.OK, "end of the parameter range")
         for mu in (0.1, 0.2)
     ]
-    return Branch("mu", np.array([0.1, 0.2]), t.cycles, (), tuple(ends))
+    values = np.array([0.1, 0.2])
+    return Branch("mu", values, t.cycles, (), tuple(ends))
 
 
 def plot(t):
@@ -81,8 +84,10 @@ def population(t):
         "group": ["old", "new"] * 3,
         "strides": [50.0] * 6,
     }
-    values = {"m": np.array([0.5, 0.6, 0.55, 0.7, 0.52, 0.63])}
-    return hj.recordings.Population(table, values, {"m": np.full(6, 0.01)})
+    moduli = np.array([0.5, 0.6, 0.55, 0.7, 0.52, 0.63])
+    values = {"m": moduli}
+    errors = np.full(6, 0.01)
+    return hj.recordings.Population(table, values, {"m": errors})
 
 
 def maps(t):
@@ -108,7 +113,10 @@ class Turning:
 
     def signals(self):
         t, x = self.state
-        return {"x": x * np.cos(2 * np.pi * t), "v": -x * np.sin(2 * np.pi * t)}
+        angle = 2 * np.pi * t
+        height = x * np.cos(angle)
+        speed = -x * np.sin(angle)
+        return {"x": height, "v": speed}
 
     def get_state(self):
         return self.state

@@ -13,7 +13,8 @@ SHAPES = [((2, 3, 4, 2), 2, 1), ((3, 2, 2), 1, 2), ((2,), 1, 1)]
 def scaled(seed, dims, ny, nu, modulus=0.7):
     """A random system whose largest multiplier has this modulus."""
     A, B, C, D = blocks_at_random(seed, dims, ny, nu)
-    size = np.abs(hj.linear.LDTP.from_blocks(A, B, C, D).multipliers[0])
+    model = hj.linear.LDTP.from_blocks(A, B, C, D)
+    size = np.abs(model.multipliers[0])
     return hj.linear.LDTP.from_blocks(
         [a * (modulus / size) ** (1 / len(dims)) for a in A], B, C, D
     )
@@ -29,7 +30,8 @@ def small():
 def exact(reference):
     """The hopper's HTFs from the independent computation: 620 frequencies, all harmonics."""
     data = reference("htf_exact_isochron")
-    H = data["H"].transpose(1, 0, 2)[..., None]
+    by_harmonic = data["H"].transpose(1, 0, 2)
+    H = by_harmonic[..., None]
     return hj.linear.HTF(
         data["f"], H, tuple(range(-16, 16)), 32, "u", ("yM", "vM"), "exact"
     )

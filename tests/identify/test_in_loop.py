@@ -21,10 +21,14 @@ def plant():
     rng = np.random.default_rng(3)
     c = np.cos(0.225)
     s = np.sin(0.225)
-    turn = 0.8 ** (1 / N) * np.array([[c, -s], [s, c]])
-    T = rng.normal(size=(N, 2, 2)) + 2 * np.eye(2)
+    rotation = np.array([[c, -s], [s, c]])
+    turn = 0.8 ** (1 / N) * rotation
+    draws = rng.normal(size=(N, 2, 2))
+    T = draws + 2 * np.eye(2)
     A = [T[(n + 1) % N] @ turn @ np.linalg.inv(T[n]) for n in range(N)]
-    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 1, 2)))
+    B = rng.normal(size=(N, 2, 1))
+    C = rng.normal(size=(N, 1, 2))
+    return hj.linear.LDTP(A, B, C)
 
 
 GAIN = np.array([[[-0.2]], [[0.1]], [[-0.15]], [[-0.1]]])
@@ -32,30 +36,41 @@ GAIN = np.array([[[-0.2]], [[0.1]], [[-0.15]], [[-0.1]]])
 
 def run(model, r, d, rng, noise=0.0, waits=False, through=0.0):
     """u = r - K y, y = P u + d, with process noise and noise of sensor and controller."""
-    A, B, C = (np.asarray(x) for x in (model.A, model.B, model.C))
+    A = np.asarray(model.A)
+    B = np.asarray(model.B)
+    C = np.asarray(model.C)
     S, n = r.shape
-    w, e, c = noise * rng.normal(size=(3, S, n))
+    draws = rng.normal(size=(3, S, n))
+    w, e, c = noise * draws
     x = np.zeros((S, A.shape[1]))
     u = np.zeros((S, n))
     y = np.zeros((S, n))
     last = np.zeros(S)
     for i in range(n):
         k = i % N
-        free = x @ C[k, 0] + d[:, i] + e[:, i] / 4
+        process = d[:, i]
+        sensor = e[:, i] / 4
+        output = x @ C[k, 0]
+        free = output + process + sensor
         answer = 0.3 * last if waits else free
         command = r[:, i] + c[:, i]
-        u[:, i] = command - GAIN[k, 0, 0] * answer
+        answered = GAIN[k, 0, 0] * answer
+        u[:, i] = command - answered
         last = free + through * u[:, i]
         y[:, i] = last
         drive = u[:, i] + w[:, i]
-        x = x @ A[k].T + drive[:, None] * B[k, :, 0]
+        carried = x @ A[k].T
+        gain = B[k, :, 0]
+        forced = drive[:, None] * gain
+        x = carried + forced
     return u, y
 
 
 def series(model, seed, strides=300, **options):
     rng = np.random.default_rng(seed)
     r = rng.normal(size=(1, N * strides))
-    u, y = run(model, r, 0 * r, rng, **options)
+    still = 0 * r
+    u, y = run(model, r, still, rng, **options)
     return hj.experiments.SectionSeries(
         np.stack([u[0], r[0]], axis=1), y[0, :, None], n_sections=N, inputs=("u", "r")
     )
@@ -66,8 +81,13 @@ def experiments(model, seed, count, noise=0.0, discard=30, together=False):
         N, 8, frequencies=(0, N / 2), inputs=2, division="orthogonal", amplitude=1.0
     )
     z = design.realizations(count, seed).signals(8 + discard)
-    r, d = (z.sum(axis=2), 0 * z[..., 0]) if together else np.moveaxis(z, 2, 0)
-    u, y = run(model, r, d, np.random.default_rng(seed), noise)
+    if together:
+        r = z.sum(axis=2)
+        d = 0 * z[..., 0]
+    else:
+        r, d = np.moveaxis(z, 2, 0)
+    rng = np.random.default_rng(seed)
+    u, y = run(model, r, d, rng, noise)
     inputs = np.concatenate(
         [u[..., None], z * [1, 1e-9]], axis=2
     )  # (a unit of its own)
@@ -87,12 +107,15 @@ def test_plant_and_controller_of_exact_data(plant):
     )
     f = loop.plant.frequencies
     exact = plant.feedback(GAIN)
-    assert len(f) == 12 and not loop.missing
+    assert len(f) == 12
+    assert not loop.missing
     assert loop.plant.error(plant.htf(f)) < 1e-9
     assert loop.controller.error(controller().htf(f)) < 1e-9
-    np.testing.assert_allclose(loop.closed.H, exact.htf(f).H, atol=1e-9)
+    expected = exact.htf(f).H
+    np.testing.assert_allclose(loop.closed.H, expected, atol=1e-9)
     # u = r - K y
-    entered = -np.array((controller().htf(f) @ exact.htf(f)).H)
+    around = controller().htf(f) @ exact.htf(f)
+    entered = -np.array(around.H)
     entered[loop.closed.harmonics.index(0)] += 1
     np.testing.assert_allclose(loop.sensitivity.H, entered, atol=1e-9)
     both = hj.estimate_htf(
@@ -108,7 +131,8 @@ def test_plant_and_controller_of_exact_data(plant):
         data.u[..., :2], data.y, n_sections=N, periods=8, inputs=SEEN[:2]
     )
     one = hj.identify.estimate_loop(data, at_input="r")
-    assert one.controller is None and "controller is not estimated" in repr(one)
+    assert one.controller is None
+    assert "controller is not estimated" in repr(one)
 
 
 def test_faint_lines_of_a_reference_are_left_out(plant):
@@ -118,7 +142,8 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     r = design.signals(208)[..., 0]
     faint = np.ones(8 * N)
     faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
-    u, y = run(plant, r, 0 * r, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    u, y = run(plant, r, 0 * r, rng)
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))
     inputs = np.stack([u, r], axis=2)
     data = hj.experiments.ExperimentData(
@@ -126,10 +151,8 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     )
     for lines, threshold in ((12, 1e-4), (8, 1e-2)):
         htf = hj.estimate_htf(data, references="r", threshold=threshold)
-        assert (
-            len(htf.frequencies) == lines
-            and htf.error(plant.htf(htf.frequencies)) < 1e-9
-        )
+        assert len(htf.frequencies) == lines
+        assert htf.error(plant.htf(htf.frequencies)) < 1e-9
 
 
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
@@ -144,10 +167,12 @@ def test_discs_and_multipliers_of_transfer_functions_hold(plant):
             controller().htf(loop.plant.frequencies),
         )
         for htf, true in zip((loop.plant, loop.controller), truth, strict=True):
-            held.append(np.mean(np.abs(htf.H - true.H) <= htf.confidence_radius()))
+            error = np.abs(htf.H - true.H)
+            held.append(np.mean(error <= htf.confidence_radius()))
         fit = hj.fit_multipliers(loop.plant, 2, check=False)
         regions.append(fit.contains(plant.multipliers)[0])
-    assert 0.92 < np.mean(held[::2]) < 0.985 and 0.92 < np.mean(held[1::2]) < 0.985
+    assert 0.92 < np.mean(held[::2]) < 0.985
+    assert 0.92 < np.mean(held[1::2]) < 0.985
     assert np.mean(regions) > 0.8
 
 
@@ -172,7 +197,8 @@ def test_instruments_of_series_hold_in_the_loop(plant):
         fit = hj.fit_series(series(plant, seed, noise=0.7), 2, references="r")
         held.append(fit.contains(plant.multipliers)[0])
         htf = fit.htf(truth.frequencies)
-        discs.append(np.mean(np.abs(htf.H - truth.H) <= htf.confidence_radius()))
+        error = np.abs(htf.H - truth.H)
+        discs.append(np.mean(error <= htf.confidence_radius()))
         few = hj.fit_series(
             series(plant, seed, 40, noise=0.5), 2, references="r", check=False
         )
@@ -186,14 +212,16 @@ def test_instruments_of_series_hold_in_the_loop(plant):
     assert 0.88 < np.mean(discs) < 0.98
     assert not fit.findings
     moved = dataclasses.replace(series(plant, 0, 150, noise=0.5), drift=20)
-    moved.y[:, 0] += 30 * np.sin(np.arange(600) / 38)
+    slow = np.sin(np.arange(600) / 38)
+    moved.y[:, 0] += 30 * slow
     moved.u[:] += 1e3  # (offsets of inputs make a drift, too)
     assert hj.fit_series(moved, 2, references="r").standard_errors[0] < 0.2
     with pytest.raises(
         hj.errors.DefinitionError, match="the reference determines 2 multipliers, not 3"
     ):
         hj.fit_series(series(plant, 0, noise=0.7), 3, references="r")
-    assert best_order(series(plant, 0), ("r",), 4) == (2, "")
+    order = best_order(series(plant, 0), ("r",), 4)
+    assert order == (2, "")
     assert (
         "3 times too few" in best_order(series(plant, 0, 20, noise=0.1), ("r",), 4)[1]
     )
@@ -201,8 +229,10 @@ def test_instruments_of_series_hold_in_the_loop(plant):
 
 def test_an_order_that_is_too_low_is_noticed_in_the_loop():
     rng = np.random.default_rng(1)
-    root = np.diag(np.array([0.8, 0.5, 0.3]) ** (1 / N))
-    T = rng.normal(size=(N, 3, 3)) + 2 * np.eye(3)
+    moduli = np.array([0.8, 0.5, 0.3])
+    root = np.diag(moduli ** (1 / N))
+    draws = rng.normal(size=(N, 3, 3))
+    T = draws + 2 * np.eye(3)
     A = [T[(n + 1) % N] @ root @ np.linalg.inv(T[n]) for n in range(N)]
     data = series(
         hj.linear.LDTP(A, rng.normal(size=(N, 3, 1)), rng.normal(size=(N, 1, 3))), 0
@@ -221,7 +251,8 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
             data.u[:, :1], data.y, n_sections=N, inputs="u"
         )
         fit = hj.fit_ldtp(data, 2, noise="innovations")
-        assert not np.asarray(fit.model.D).any() or "D was fitted" in repr(fit)
+        has_direct = np.asarray(fit.model.D).any()
+        assert not has_direct or "D was fitted" in repr(fit)
         held.append(fit.contains(plant.multipliers, 0.99)[0])
         biased = hj.fit_series(data, 2, check=False)
         (doubt,) = (x for x in biased.findings if x.cause == "feedback")
@@ -229,7 +260,8 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     assert sum(held) >= 7
     assert "biased" in repr(hj.fit_ldtp(data, 2, check=False).findings)
     data = series(plant, 0, noise=0.5)  # (r, and what it does)
-    data = hj.experiments.SectionSeries(data.u[:, 1:], data.y, n_sections=N, inputs="r")
+    u = data.u[:, 1:]
+    data = hj.experiments.SectionSeries(u, data.y, n_sections=N, inputs="r")
     assert not hj.fit_series(data, 2, check=False).findings
     assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
@@ -237,16 +269,21 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
 def test_whether_outputs_answer_at_once_is_found(plant):
     for waits, through in ((False, 0.0), (True, 0.0), (True, 1.0)):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
-        noise = 0.1 * np.random.default_rng(0).normal(size=data.y.shape)
-        moved = {"u": data.u + 10, "y": data.y + noise + 10, "drift": np.inf}
+        white = np.random.default_rng(0).normal(size=data.y.shape)
+        noise = 0.1 * white
+        outputs = data.y + noise + 10
+        moved = {"u": data.u + 10, "y": outputs, "drift": np.inf}
         fit = hj.fit_ldtp(dataclasses.replace(data, **moved), 2, references="r")
-        assert bool(np.asarray(fit.model.D).any()) == bool(through)
+        has_direct = bool(np.asarray(fit.model.D).any())
+        assert has_direct == bool(through)
         np.testing.assert_allclose(fit.model.D, through, atol=0.1)
         assert fit.contains(plant.multipliers, 0.999).all()
     r = np.sin(0.2 * np.pi * np.arange(60 * N))[
         None
     ]  # (a statistic of -5e-4, by rounding)
-    u, y = run(plant, r, 0 * r, np.random.default_rng(0), waits=True)
+    rng = np.random.default_rng(0)
+    still = 0 * r
+    u, y = run(plant, r, still, rng, waits=True)
     data = hj.experiments.SectionSeries(
         np.stack([*u, *r], axis=1), y.T, n_sections=N, inputs=("u", "r")
     )
@@ -262,8 +299,12 @@ def test_a_plant_that_is_stable_in_its_loop_only():
     # x[n + 1] = 1.2 x + u, u = r - 0.9 y
     one = np.ones((N, 1, 1))
     plant = hj.linear.LDTP(1.2 * one, one, one)
-    r, e = np.random.default_rng(0).normal(size=(2, N * 400))
-    x = np.asarray(plant.feedback([[0.9]]).simulate((r - 0.27 * e)[:, None]))[:, 0]
+    rng = np.random.default_rng(0)
+    r, e = rng.normal(size=(2, N * 400))
+    loop = plant.feedback([[0.9]])
+    push = (r - 0.27 * e)[:, None]
+    states = np.asarray(loop.simulate(push))
+    x = states[:, 0]
     y = x + 0.3 * e
     data = hj.experiments.SectionSeries(
         np.stack([r - 0.9 * y, r], 1), y[:, None], n_sections=N, inputs=("u", "r")
@@ -273,7 +314,8 @@ def test_a_plant_that_is_stable_in_its_loop_only():
         hj.fit_series(data, 1, references="r"),
     ):
         assert fit.contains(plant.multipliers, 0.999).all()
-        assert abs(fit.multipliers[0] - 1.2**N) < 0.1
+        error = abs(fit.multipliers[0] - 1.2**N)
+        assert error < 0.1
 
 
 def test_residuals_tell_of_the_loop(plant):
@@ -287,7 +329,8 @@ def test_residuals_tell_of_the_loop(plant):
     )
     biased = hj.fit_series(alone, 2, check=False)
     assert not hj.validate(biased, late, references="r").independent
-    driven = dataclasses.replace(early, u=early.u[:, 1:], inputs=("r",))
+    push = early.u[:, 1:]
+    driven = dataclasses.replace(early, u=push, inputs=("r",))
     for record, answers in (alone, True), (driven, False):
         fit = hj.fit_series(record, 2, check=False)
         grid = CycleGrid.from_records([record])

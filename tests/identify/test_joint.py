@@ -62,14 +62,17 @@ def test_the_coordinates_are_as_many_as_there_are_models(model, exact, growth):
     """Entries of all matrices less those of changes of state, and the data show every one; also of
     an unstable system."""
     model = eqx.tree_at(lambda m: m.A, model, growth * model.A)
-    assert (np.abs(model.multipliers).max() > 1) == (growth > 1)
+    is_unstable = np.abs(model.multipliers).max() > 1
+    assert is_unstable == (growth > 1)
     coordinates = local_coordinates(PeriodicModel.of(model, ONE), direct=True)
     dims = np.asarray(model.dims)
     after = np.roll(dims, -1)
-    entries = (after * dims + after * 2 + 2 * dims + 4).sum()
+    by_section = after * dims + after * 2 + 2 * dims + 4
+    entries = by_section.sum()
     assert coordinates.size == entries - (dims**2).sum()
     found = transfer(coordinates.model, F, exact.harmonics)
-    np.testing.assert_allclose(found, model.htf(F).H, rtol=1e-9, atol=1e-9)
+    expected = model.htf(F).H
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
     J = np.concatenate(
         [
             s.reshape(len(s), -1)
@@ -113,7 +116,8 @@ def test_derivatives_are_those_of_jax(model, errors):
         [s for _, s in transfer_slopes(coordinates, F, harmonics)], axis=2
     )
     true = np.asarray(true)[np.array(harmonics)]
-    np.testing.assert_allclose(np.tensordot(step, slopes, 1), true, atol=1e-11)
+    along = np.tensordot(step, slopes, 1)
+    np.testing.assert_allclose(along, true, atol=1e-11)
     c, by_step = characteristic_slopes(coordinates)
     np.testing.assert_allclose(
         c, np.poly(np.asarray(model.multipliers)).real[1:], atol=1e-12
@@ -122,14 +126,17 @@ def test_derivatives_are_those_of_jax(model, errors):
         local_coordinates(coordinates.moved(h * step), True) for h in (1e-6, -1e-6)
     )
     ahead, back = (characteristic_slopes(x)[0] for x in moved)
-    np.testing.assert_allclose(by_step @ step, (ahead - back) / 2e-6, rtol=1e-6)
+    by_differences = (ahead - back) / 2e-6
+    np.testing.assert_allclose(by_step @ step, by_differences, rtol=1e-6)
 
 
 @pytest.mark.parametrize("variance", (None, 4e-4))
 def test_exact_htfs_give_the_exact_model(model, exact, variance):
     htf = with_values(exact, exact.H, variance)
-    fit = hj.fit_ldtp(htf, initial=shaken(model, np.random.default_rng(1)))
-    assert fit.result == hj.errors.Result.OK and "too few dimensions" not in repr(fit)
+    start = shaken(model, np.random.default_rng(1))
+    fit = hj.fit_ldtp(htf, initial=start)
+    assert fit.result == hj.errors.Result.OK
+    assert "too few dimensions" not in repr(fit)
     assert "too few dimensions" in repr(hj.fit_ldtp(htf, 1).findings)
     dense = model.htf(np.linspace(0.01, 0.49, 97))
     assert "`order` may be too low" in repr(hj.fit_multipliers(dense, 1))
@@ -137,7 +144,8 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
         1e-8 if variance is None else 1e-5
     )  # (where they are known, 0.1 standard errors do)
     assert fit.compare(model.multipliers).max_error < off
-    assert np.max(fit.model.htf(F).error(exact)) < off
+    error = fit.model.htf(F).error(exact)
+    assert np.max(error) < off
     np.testing.assert_allclose(
         fit.htf(F).H, fit.model.htf(F, fit.harmonics).H, atol=1e-12
     )
@@ -145,14 +153,16 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
 
 def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
     """20 dB, at which the misfit is 1.6 times the expected one."""
-    model = hj.linearize(hopper_cycle, hj.ClockPhase(8), ("yM", "vM"))
+    sections = hj.ClockPhase(8)
+    model = hj.linearize(hopper_cycle, sections, ("yM", "vM"))
     design = (
         hj.multisine(8, periods=16, frequencies=(0, 4)).scaled(rms=0.05).realizations(4)
     )
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
     htf = hj.estimate_htf(hj.experiments.add_noise(data, snr=20, seed=0))
     for dims, named in ((2, True), (model.dims, False)):
-        assert ("too few dimensions" in repr(hj.fit_ldtp(htf, dims).findings)) == named
+        findings = repr(hj.fit_ldtp(htf, dims).findings)
+        assert ("too few dimensions" in findings) == named
 
 
 def test_undetermined_responses_have_infinite_variance():
@@ -160,10 +170,14 @@ def test_undetermined_responses_have_infinite_variance():
     small = scaled(3, (2, 3, 4, 2), 2, 1)
     f = np.arange(1, 40) / 80
     htf = small.htf(f, (-1, 0, 1))
-    draw = noisy(htf, np.full(htf.H.shape, 1e-6), np.random.default_rng(0))
-    fit = hj.fit_ldtp(draw, initial=shaken(small, np.random.default_rng(1)))
-    variance = fit.htf(f, (-2, -1, 0, 1)).variance
-    assert np.isinf(variance[0]).all() and variance[1:].max() < 1e-6
+    small_variance = np.full(htf.H.shape, 1e-6)
+    draw = noisy(htf, small_variance, np.random.default_rng(0))
+    start = shaken(small, np.random.default_rng(1))
+    fit = hj.fit_ldtp(draw, initial=start)
+    fitted = fit.htf(f, (-2, -1, 0, 1))
+    variance = fitted.variance
+    assert np.isinf(variance[0]).all()
+    assert variance[1:].max() < 1e-6
     assert fit.contains(small.multipliers[:2], 0.999).all()
 
 
@@ -178,16 +192,23 @@ def test_errors_are_as_small_as_the_bound(model, exact):
         for _ in range(draws)
     ]
     error = np.array([fit.coefficients - bound.coefficients for fit in fits])
-    square = np.einsum("si,ij,sj->", error, np.linalg.inv(bound.covariance), error)
-    assert 1e-3 < stats.chi2(2 * draws).cdf(square) < 1 - 1e-3
+    information = np.linalg.inv(bound.covariance)
+    square = np.einsum("si,ij,sj->", error, information, error)
+    below = stats.chi2(2 * draws).cdf(square)
+    assert 1e-3 < below < 1 - 1e-3
     cost = sum(fit.cost for fit in fits)
-    assert 1e-3 < stats.chi2(sum(fit.dof for fit in fits)).cdf(cost) < 1 - 1e-3
-    hits = sum(int(fit.contains(model.multipliers).all()) for fit in fits)
+    dof = sum(fit.dof for fit in fits)
+    assert 1e-3 < stats.chi2(dof).cdf(cost) < 1 - 1e-3
+    inside = [fit.contains(model.multipliers).all() for fit in fits]
+    hits = sum(int(x) for x in inside)
     assert stats.binomtest(hits, draws, 0.95).pvalue > 1e-3
     H = np.array([fit.htf(F).H for fit in fits])
-    variance = np.mean([fit.htf(F).variance for fit in fits], axis=0)
-    square = np.mean(np.abs(H - np.asarray(exact.H)) ** 2, axis=0)
-    assert abs(np.mean(square / variance) - 1) < 0.1
+    variances = [fit.htf(F).variance for fit in fits]
+    variance = np.mean(variances, axis=0)
+    apart = np.abs(H - np.asarray(exact.H))
+    square = np.mean(apart**2, axis=0)
+    ratio = np.mean(square / variance)
+    assert abs(ratio - 1) < 0.1
     # Without variances, the residuals give them.
     draw = noisy(exact, exact.variance, np.random.default_rng(4))
     fit = hj.fit_ldtp(with_values(draw, draw.H), initial=model)
@@ -201,7 +222,8 @@ def test_with_one_section_the_bound_is_that_of_free_numerators():
         [[[0.6, 0.3], [-0.4, 0.5]]], [[[1.0], [0.5]]], [[[1.0, -0.3]]], [[[0.2]]]
     )
     f = np.linspace(0.02, 0.48, 30)
-    htf = with_values(one.htf(f), one.htf(f).H, 1e-4)
+    exact = one.htf(f)
+    htf = with_values(exact, exact.H, 1e-4)
     free = hj.identify.cramer_rao(one, htf, extra_lags=0)
     joint = hj.identify.cramer_rao(one, htf, estimator="fit_ldtp")
     np.testing.assert_allclose(joint.covariance, free.covariance, rtol=1e-8)

@@ -20,7 +20,8 @@ SHAPES = [((2, 3, 1, 2), 2, 1, 6), ((1, 3, 2), 1, 2, 5), ((2,), 1, 1, 9)]
 @given(st.sampled_from(SHAPES), st.integers(0, 99))
 def test_any_system_is_identified_exactly(shape, seed):
     dims, ny, nu, periods = shape
-    model = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    blocks = blocks_at_random(seed, dims, ny, nu)
+    model = hj.linear.LDTP.from_blocks(*blocks)
     N = len(dims)
     top = N * periods // 2 / periods
     design = hj.multisine(N, periods, (0, top), 1.0, seed, lines="two-phase", inputs=nu)
@@ -34,7 +35,8 @@ def test_any_system_is_identified_exactly(shape, seed):
 
 
 def test_two_inputs_may_share_an_experiment_on_different_lines(hopper):
-    model = hj.linear.LDTP.from_blocks(*blocks_at_random(5, (2, 1, 3), 1, 2))
+    blocks = blocks_at_random(5, (2, 1, 3), 1, 2)
+    model = hj.linear.LDTP.from_blocks(*blocks)
     lines = [[0.1, 0.3], [0.1, 0.3]]
     design = hj.experiments.Design.from_lines(
         lines, 1.0, 0.4, n_sections=3, periods=10, channels=[[0, 1], [1, 0]], inputs=2
@@ -42,7 +44,8 @@ def test_two_inputs_may_share_an_experiment_on_different_lines(hopper):
     data = hj.experiments.simulate_experiments(model, design, start="periodic")
     estimate = hj.estimate_htf(data, (-1, 0))
     assert estimate.harmonics == (-1, 0)
-    assert_allclose(estimate.H, model.htf([0.1, 0.3], (-1, 0)).H, atol=1e-13)
+    expected = model.htf([0.1, 0.3], (-1, 0)).H
+    assert_allclose(estimate.H, expected, atol=1e-13)
 
 
 def test_repeated_frequencies_are_averaged_by_their_power():
@@ -50,7 +53,8 @@ def test_repeated_frequencies_are_averaged_by_their_power():
     lines = [[0.25]] * 2, [[1.0], [2.0]], [[0.3], [2.0]]
     design = hj.experiments.Design.from_lines(*lines, n_sections=4, periods=4)
     u = design.signals(9)
-    y = u * np.array([1.0, 3.0])[:, None, None]
+    gains = np.array([1.0, 3.0])
+    y = u * gains[:, None, None]
     estimate = hj.estimate_htf(
         hj.experiments.ExperimentData(u, y, n_sections=4, periods=4)
     )
@@ -64,14 +68,16 @@ def failed(data, experiments):
     """The same data, as if these experiments had failed at sample 50."""
     y = data.y.copy()
     result = data.result.copy()
-    y[experiments, 50:], result[experiments] = np.nan, hj.errors.Result.BLOW_UP
+    y[experiments, 50:] = np.nan
+    result[experiments] = hj.errors.Result.BLOW_UP
     return dataclasses.replace(data, y=y, result=result)
 
 
 def test_failed_experiments_are_left_out(paper_data, paper_estimate):
     design = hj.experiments.paper_design()
     data = failed(paper_data, [3, 70])
-    lost = np.sort(design.frequency[np.isin(design.experiment, [3, 70])])
+    is_lost = np.isin(design.experiment, [3, 70])
+    lost = np.sort(design.frequency[is_lost])
     estimate = hj.estimate_htf(data)
     assert_array_equal(estimate.frequencies, np.setdiff1d(design.frequencies, lost))
     kept = np.isin(paper_estimate.frequencies, estimate.frequencies)
@@ -94,14 +100,18 @@ def record(*cosines, n_sections=8, periods=8, cycles=8):
 
 
 def test_half_integers_need_two_phases():
-    measured = hj.estimate_htf(record([(1.5, 0.3), (0.25, 0.0)])).frequencies
+    data = record([(1.5, 0.3), (0.25, 0.0)])
+    measured = hj.estimate_htf(data).frequencies
     assert_array_equal(measured, [0.25])
-    opposite = record([(1.5, 0.3)], [(1.5, 0.3 + np.pi)])
+    first = [(1.5, 0.3)]
+    second = [(1.5, 0.3 + np.pi)]
+    opposite = record(first, second)
     with pytest.raises(
         hj.errors.DefinitionError, match="multiples of 1/2 with two phases"
     ):
         hj.estimate_htf(opposite)
-    uneven = hj.estimate_htf(record([(1.5, 0.3)], [(1.5, 0.9)], [(1.5, 2.0)]))
+    data = record([(1.5, 0.3)], [(1.5, 0.9)], [(1.5, 2.0)])
+    uneven = hj.estimate_htf(data)
     assert_allclose(uneven[0], 1.0, atol=1e-13)
     assert_allclose(uneven[-3], 0.0, atol=1e-13)
     assert_array_equal(uneven.variance_dof.dof, 1)  # (of three for two unknowns)

@@ -18,15 +18,20 @@ from .test_uncertainty import (
 @pytest.mark.parametrize("size", [1.0, 100.0])
 def test_two_multipliers_are_two(size, small, variance):
     _, htf = small
-    data = noisy(htf, size * variance, np.random.default_rng(0))
+    rng = np.random.default_rng(0)
+    data = noisy(htf, size * variance, rng)
     found = hj.select_order(data, 4)
-    assert np.all(found.deviation[:2] > 10) and np.all(
-        np.abs(found.strength[2:] - 1) < 0.2
-    )
-    np.testing.assert_allclose(found.cost[2:] / found.dof[2:], 1.0, atol=0.2)
+    assert np.all(found.deviation[:2] > 10)
+    apart = np.abs(found.strength[2:] - 1)
+    assert np.all(apart < 0.2)
+    ratio = found.cost[2:] / found.dof[2:]
+    np.testing.assert_allclose(ratio, 1.0, atol=0.2)
     blind = hj.select_order(with_variance(htf, data.H, None), 4)
-    assert all((x.by_rank, x.by_mdl, x.order) == (2, 2, 2) for x in (found, blind))
-    assert "by rank: 2" in repr(found) and len(repr(found).splitlines()) == 7
+    for x in (found, blind):
+        orders = (x.by_rank, x.by_mdl, x.order)
+        assert orders == (2, 2, 2)
+    assert "by rank: 2" in repr(found)
+    assert len(repr(found).splitlines()) == 7
 
 
 @pytest.mark.parametrize(("few", "runs"), [(False, 50), (True, 12)])
@@ -39,8 +44,11 @@ def test_the_level_of_the_rank_test(small, variance, few, runs):
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance[1:], rng)
         if few:
-            rough = variance[1:] * rng.gamma(3.0, 1 / 3, variance[1:].shape)
-            data = with_variance(htf, data.H, rough, np.full(80, 3.0))
+            shape = variance[1:].shape
+            factors = rng.gamma(3.0, 1 / 3, shape)
+            rough = variance[1:] * factors
+            dof = np.full(80, 3.0)
+            data = with_variance(htf, data.H, rough, dof)
         try:
             hj.fit_multipliers(data, 3)
         except hj.errors.DefinitionError as error:
@@ -56,11 +64,10 @@ def test_exact_htfs_have_no_more_multipliers(small):
     ):
         hj.fit_multipliers(htf, 3)
     spurious = hj.fit_multipliers(htf, 3, check=False)
-    assert np.isinf(spurious.standard_errors).all() and "± inf" in repr(spurious)
-    assert (
-        spurious.contains(0.5).all()
-        and "support 2 multipliers, not 3" in spurious.findings[0].text
-    )
+    assert np.isinf(spurious.standard_errors).all()
+    assert "± inf" in repr(spurious)
+    assert spurious.contains(0.5).all()
+    assert "support 2 multipliers, not 3" in spurious.findings[0].text
     assert (
         hj.select_order(scaled(12, (1, 1), 1, 1).htf(np.arange(1, 46) / 46)).order == 1
     )
@@ -71,12 +78,19 @@ def test_a_weak_multiplier_that_was_left_out_is_named(size):
     """A pair of modulus 0.7, and a multiplier of 0.4 that the input excites by `size` as much."""
     real = 0.7 * np.cos(0.9)
     imaginary = 0.7 * np.sin(0.9)
-    A = np.array([[real, imaginary, 0], [-imaginary, real, 0], [0, 0, 0.4]])
+    A = np.array(
+        [
+            [real, imaginary, 0],
+            [-imaginary, real, 0],
+            [0, 0, 0.4],
+        ]
+    )
     named = 0
     for seed in range(6):
         rng = np.random.default_rng(seed)
         # Three sections; the states change after the last one.
-        B = rng.normal(size=(3, 3)) * [1, 1, size]
+        draws = rng.normal(size=(3, 3))
+        B = draws * [1, 1, size]
         C = rng.normal(size=(3, 2, 3))
         u = rng.normal(size=1350)
         y = np.zeros((1350, 2))
@@ -88,7 +102,8 @@ def test_a_weak_multiplier_that_was_left_out_is_named(size):
             if n == 2:
                 x = A @ x
         y += 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
-        data = hj.experiments.SectionSeries(u[:, None], y, n_sections=3)
+        inputs = u[:, None]
+        data = hj.experiments.SectionSeries(inputs, y, n_sections=3)
         fit = hj.fit_series(data, 2)
         named += "order" in [finding.cause for finding in fit.findings]
     if size:

@@ -10,14 +10,17 @@ def test_the_bias_on_exact_data(exact, multipliers):
     fit = hj.identify.fit_rational(exact)
     errors = [fit.compare(multipliers, name).max_error for name in fit.outputs]
     np.testing.assert_allclose(errors, (2.6e-3, 1.07e-2), atol=0.05e-3)
-    assert np.all(fit.result == hj.errors.Result.OK) and fit.outputs == ("yM", "vM")
+    assert np.all(fit.result == hj.errors.Result.OK)
+    assert fit.outputs == ("yM", "vM")
     np.testing.assert_array_equal(fit.multipliers, fit.poles**32)
 
 
 def rational(f, numerator, denominator, sections):
-    w = np.exp(-2j * np.pi * np.asarray(f) / sections)
+    angles = -2j * np.pi * np.asarray(f)
+    w = np.exp(angles / sections)
     top = sum(b * w ** (1 + r) for r, b in enumerate(numerator))
-    return top / sum(a * w**r for r, a in enumerate(denominator))
+    bottom = sum(a * w**r for r, a in enumerate(denominator))
+    return top / bottom
 
 
 def test_no_start_finds_a_better_fit(exact):
@@ -27,7 +30,9 @@ def test_no_start_finds_a_better_fit(exact):
     h = np.asarray(exact[0])[:, 1, 0]
 
     def residual(x):
-        e = (h - rational(f, x[2:], [1, *x[:2]], 32)) / np.linalg.norm(h)
+        denominator = [1, *x[:2]]
+        fitted = rational(f, x[2:], denominator, 32)
+        e = (h - fitted) / np.linalg.norm(h)
         return np.concatenate([e.real, e.imag])
 
     own = [*fit.denominator[0, 1:], *fit.numerator[0]]
@@ -38,14 +43,18 @@ def test_no_start_finds_a_better_fit(exact):
     for radius, angle in zip(
         rng.uniform(0.5, 1.0, 20), rng.uniform(0, 2, 20), strict=True
     ):
-        a = [-2 * radius * np.cos(angle), radius**2]
+        middle = -2 * radius * np.cos(angle)
+        a = [middle, radius**2]
         columns = [rational(f, b, [1, *a], 32) for b in ([1], [0, 1])]
-        columns = np.stack([np.concatenate([c.real, c.imag]) for c in columns], axis=1)
-        b = np.linalg.lstsq(columns, np.concatenate([h.real, h.imag]))[0]
+        parts = [np.concatenate([c.real, c.imag]) for c in columns]
+        columns = np.stack(parts, axis=1)
+        values = np.concatenate([h.real, h.imag])
+        b = np.linalg.lstsq(columns, values)[0]
         found = scipy.optimize.least_squares(
             residual, [*a, *b], x_scale="jac", max_nfev=50
         )
-        assert np.linalg.norm(found.fun) > fit.residual[0] * (1 - 1e-6)
+        found_cost = np.linalg.norm(found.fun)
+        assert found_cost > fit.residual[0] * (1 - 1e-6)
 
 
 def test_a_rational_function_is_found_exactly():
@@ -62,10 +71,13 @@ def test_a_rational_function_is_found_exactly():
     np.testing.assert_allclose(
         np.sort_complex(fit.zeros[0]), np.roots(numerator)[::-1], atol=1e-6
     )
-    np.testing.assert_allclose(fit.htf(f).H[0, :, 0, 0], h, atol=1e-6)
+    found = fit.htf(f).H[0, :, 0, 0]
+    np.testing.assert_allclose(found, h, atol=1e-6)
     assert fit.residual[0] < 1e-7
     # More poles than there are: the fit stays good and the true ones are among them.
     more = hj.identify.fit_rational(
         hj.linear.HTF(f, h[None, :, None, None], 0, 5), poles=4, zeros=3
     )
-    assert np.all(np.abs(more.poles[0] - poles[:, None]).min(axis=1) < 1e-4)
+    shift = more.poles[0] - poles[:, None]
+    distances = np.abs(shift)
+    assert np.all(distances.min(axis=1) < 1e-4)

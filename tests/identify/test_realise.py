@@ -23,8 +23,10 @@ def test_the_hopper_from_a_band_of_frequencies(exact, hopper, multipliers):
     model = realized_htf(exact)
     np.testing.assert_array_equal(model.dims, MINIMAL)
     np.testing.assert_allclose(model.multipliers, multipliers, atol=1e-11)
-    assert model.htf(F).error(hopper.htf(F)).max() < 1e-10
-    assert model.inputs == ("u",) and model.outputs == ("yM", "vM")
+    error = model.htf(F).error(hopper.htf(F))
+    assert error.max() < 1e-10
+    assert model.inputs == ("u",)
+    assert model.outputs == ("yM", "vM")
 
 
 @settings(max_examples=5)
@@ -37,7 +39,8 @@ def test_random_systems(shape, seed):
     htf = model.htf(f)
     markov = np.asarray(model.impulse_response(40))
     for found in (realized_htf(htf), realized(markov)):
-        assert np.all(np.asarray(found.dims) <= np.asarray(model.dims))
+        found_dims = np.asarray(found.dims)
+        assert np.all(found_dims <= np.asarray(model.dims))
         assert (
             found.htf(f)
             .error(
@@ -58,16 +61,25 @@ def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
         hj.experiments.SectionSeries(data.u, y, n_sections=32, outputs=("yM", "vM")), 2
     )
     model = fit.model
-    assert np.all((np.asarray(model.dims) >= 2) & (np.asarray(model.dims) <= 4))
-    assert model.htf(F).error(hopper.htf(F)).max() < 2e-3
-    assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
+    dims = np.asarray(model.dims)
+    assert np.all((dims >= 2) & (dims <= 4))
+    error = model.htf(F).error(hopper.htf(F))
+    assert error.max() < 2e-3
+    difference = np.abs(model.multipliers[:2] - multipliers)
+    assert difference.max() < 2e-3
 
 
 def test_from_noisy_htfs(exact, hopper, multipliers):
     rng = np.random.default_rng(0)
-    variance = np.full(exact.H.shape, (1e-4 * np.abs(exact.H).max()) ** 2)
-    error = rng.normal(size=exact.H.shape) + 1j * rng.normal(size=exact.H.shape)
-    H = exact.H + np.sqrt(variance / 2) * error
+    size = 1e-4 * np.abs(exact.H).max()
+    variance = np.full(exact.H.shape, size**2)
+    shape = exact.H.shape
+    real = rng.normal(size=shape)
+    imaginary = rng.normal(size=shape)
+    error = real + 1j * imaginary
+    size_of_errors = np.sqrt(variance / 2)
+    H = exact.H + size_of_errors * error
     model = realized_htf(dataclasses.replace(exact, H=H, variance=variance), order=2)
     assert np.all(np.asarray(model.dims) <= MINIMAL)
-    assert np.abs(model.multipliers[:2] - multipliers).max() < 2e-3
+    difference = np.abs(model.multipliers[:2] - multipliers)
+    assert difference.max() < 2e-3

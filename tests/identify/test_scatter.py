@@ -18,7 +18,9 @@ LINES = hj.multisine(N, P, (0, 2.0), 0.1, experiments=4)
 def model():
     rng = np.random.default_rng(0)
     A = 0.6 * rng.normal(size=(N, 2, 2))
-    return hj.linear.LDTP(A, rng.normal(size=(N, 2, 1)), rng.normal(size=(N, 2, 2)))
+    B = rng.normal(size=(N, 2, 1))
+    C = rng.normal(size=(N, 2, 2))
+    return hj.linear.LDTP(A, B, C)
 
 
 def realized(model, count, repeats=1, noise=0.0, seed=0, process_noise=0.0):
@@ -35,8 +37,10 @@ def inside(model, count, repeats, variance, runs=40, **more):
     for seed in range(runs):
         data = realized(model, count, repeats, seed=seed, **more)
         estimate = hj.estimate_htf(data, 0, repeats=repeats, variance=variance)
-        error = np.abs(estimate[0] - model.htf(estimate.frequencies, 0)[0])
-        hits.append((error <= estimate.confidence_radius()[0])[::3])
+        exact = model.htf(estimate.frequencies, 0)[0]
+        error = np.abs(estimate[0] - exact)
+        is_inside = error <= estimate.confidence_radius()[0]
+        hits.append(is_inside[::3])
     return np.sum(hits), np.size(hits)
 
 
@@ -63,27 +67,35 @@ def test_discs_whatever_the_errors_are(constant, noise, R):
     sizes alone hold 90 % (three realizations), 92 % (four), 94 % (eight); two tell no more."""
     rng = np.random.default_rng(R)
     runs = 20_000
-    phases = 2 * np.pi * rng.random((R, runs))
-    parts = np.sqrt(0.5) * rng.normal(size=(R, runs, 2))
-    error = constant * np.exp(1j * phases) + noise * parts @ [1, 1j]
+    turns = rng.random((R, runs))
+    phases = 2 * np.pi * turns
+    draws = rng.normal(size=(R, runs, 2))
+    parts = np.sqrt(0.5) * draws
+    bias = constant * np.exp(1j * phases)
+    error = bias + noise * parts @ [1, 1j]
     shares = np.full((R, 1), 1 / R)
     if constant == 0:
         # Of experiments of different strengths; Gaussian errors know nothing of it.
-        shares = rng.dirichlet(np.full(R, 3.0))[:, None]
+        concentration = np.full(R, 3.0)
+        shares = rng.dirichlet(concentration)[:, None]
         error /= np.sqrt(shares)
     mean = np.sum(shares * error, axis=0)
     residuals = np.sqrt(shares) * (error - mean)
     square = (np.abs(residuals) ** 2).sum(axis=0)
     turned = (residuals**2).sum(axis=0)
     variance = square / (R - 1)
-    shape = roundness(square, turned, np.full(runs, 1.0 * R))
+    number = np.full(runs, 1.0 * R)
+    shape = roundness(square, turned, number)
     dof = np.full(runs, R - 1.0)
-    variance_dof = hj.linear.VarianceDof(dof, shape[None, :, None, None])
+    by_line = shape[None, :, None, None]
+    variance_dof = hj.linear.VarianceDof(dof, by_line)
     for level in (0.5, 0.8, 0.95, 0.99):
-        quantile = np.asarray(variance_dof.quantile(level))[0, :, 0, 0]
+        quantiles = np.asarray(variance_dof.quantile(level))
+        quantile = quantiles[0, :, 0, 0]
         inside = np.abs(mean) ** 2 <= quantile * variance
         if constant == 0:
-            assert stats.binomtest(int(inside.sum()), runs, level).pvalue > 1e-3
+            count = int(inside.sum())
+            assert stats.binomtest(count, runs, level).pvalue > 1e-3
         elif R > 3 and level == 0.95:
             assert 0.935 < inside.mean() < 0.965
     if R == 2:
@@ -95,7 +107,8 @@ def test_the_parts_of_the_variance(model):
     data = realized(model, 40, 8, noise=0.2)
     estimate = hj.estimate_htf(data, repeats=8)
     np.testing.assert_array_equal(estimate.variance_dof.dof, 39)
-    once = LINES.expected_variance(0.2, repeats=8)[0, 0] / 40
+    one_block = LINES.expected_variance(0.2, repeats=8)
+    once = one_block[0, 0] / 40
     np.testing.assert_allclose(np.mean(estimate.variance), once, rtol=0.03)
     np.testing.assert_allclose(np.mean(estimate.noise_variance), once, rtol=0.03)
     alone = hj.estimate_htf(data, repeats=8, variance="noise")
@@ -111,10 +124,12 @@ def test_distortion_is_what_noise_is_not(model):
         data.u, data.y + 5 * data.u**3, n_sections=N, periods=P
     )
     estimate = hj.estimate_htf(bent, (0,), repeats=2)
-    assert np.all(estimate.noise_variance < 1e-25) and np.all(estimate.variance > 1e-8)
+    assert np.all(estimate.noise_variance < 1e-25)
+    assert np.all(estimate.variance > 1e-8)
     exact = model.htf(estimate.frequencies, 0)[0]
     # The best linear approximation is not the linear part, by 3 u^3 -> 9 var(u) u for many lines.
-    assert np.all(np.abs(estimate[0] - exact) > estimate.confidence_radius()[0])
+    error = np.abs(estimate[0] - exact)
+    assert np.all(error > estimate.confidence_radius()[0])
 
 
 def test_sums_of_parts_are_those_of_the_whole(model):
@@ -128,7 +143,8 @@ def test_sums_of_parts_are_those_of_the_whole(model):
     one = hj.estimate_htf(data, repeats=2)
     many = hj.estimate_htf(parts, repeats=2)
     for name in ("H", "variance", "noise_variance"):
-        np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=1e-9)
+        of_many = getattr(many, name)
+        np.testing.assert_allclose(of_many, getattr(one, name), rtol=1e-9)
     np.testing.assert_array_equal(many.variance_dof.dof, one.variance_dof.dof)
     np.testing.assert_allclose(
         many.variance_dof.roundness, one.variance_dof.roundness, rtol=1e-9
@@ -143,8 +159,11 @@ def test_a_failed_realization_leaves_the_others(model):
         data.u, data.y, n_sections=N, periods=P, result=result
     )
     estimate = hj.estimate_htf(data)
-    lost = np.isin(estimate.frequencies, LINES.frequency[LINES.experiment == 0])
-    ratio = np.mean(estimate.variance[:, lost]) / np.mean(estimate.variance[:, ~lost])
+    of_first = LINES.frequency[LINES.experiment == 0]
+    lost = np.isin(estimate.frequencies, of_first)
+    of_lost = np.mean(estimate.variance[:, lost])
+    of_others = np.mean(estimate.variance[:, ~lost])
+    ratio = of_lost / of_others
     assert ratio == pytest.approx(2, rel=0.3)  # of one experiment instead of two
     np.testing.assert_array_equal(
         estimate.variance_dof.dof, np.where(lost, (~lost).sum(), 1)
@@ -163,7 +182,8 @@ def test_pairs_cancel_even_distortion(model):
         data.u, data.y + 0.3 * data.u**2, n_sections=N, periods=P
     )
     estimate = hj.estimate_htf(bent.odd_part())
-    assert estimate.error(model.htf(estimate.frequencies)).max() < 1e-12
+    error = estimate.error(model.htf(estimate.frequencies))
+    assert error.max() < 1e-12
     with pytest.raises(
         hj.errors.DefinitionError, match="experiments 0 and 1 are no pair"
     ):
@@ -173,7 +193,9 @@ def test_pairs_cancel_even_distortion(model):
 def test_noise_by_its_ratio(model):
     data = realized(model, 1, 4)
     noisy = hj.experiments.add_noise(data, snr=20, seed=3)
-    ratio = np.var(noisy.y - data.y, axis=(0, 1)) / np.mean(data.y**2, axis=(0, 1))
+    noise = np.var(noisy.y - data.y, axis=(0, 1))
+    power = np.mean(data.y**2, axis=(0, 1))
+    ratio = noise / power
     np.testing.assert_allclose(ratio, 0.01, rtol=0.2)
 
 
@@ -193,10 +215,14 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
     rng = np.random.default_rng(0)
     weight = dof / rng.gamma(dof, size=(4000, 300))
     error = rng.normal(size=weight.shape)
-    estimate = (weight * error).sum(axis=1) / weight.sum(axis=1)
-    misfit = np.mean(weight * (error - estimate[:, None]) ** 2) * 300 / 299
+    total = weight.sum(axis=1)
+    estimate = (weight * error).sum(axis=1) / total
+    squares = (error - estimate[:, None]) ** 2
+    misfit = np.mean(weight * squares) * 300 / 299
     _, deviation = estimated_noise(dof / (dof - 1), misfit)
-    actual = np.mean(estimate**2) / np.mean(1 / weight.sum(axis=1))
+    weights = weight.sum(axis=1)
+    expected = np.mean(1 / weights)
+    actual = np.mean(estimate**2) / expected
     assert actual == pytest.approx(
         deviation**2, rel=0.12
     )  # (freedom / (freedom - 2) at most)
@@ -205,8 +231,10 @@ def test_weights_from_estimated_variances_widen_the_errors_of_fits(dof):
 def test_fits_know_of_estimated_variances(model):
     exact = model.htf(np.arange(1, 32) / 16)
     H = np.asarray(exact.H)
-    drawn = np.random.default_rng(0).normal(size=(2, *H.shape))
-    variance = 0.1 * np.random.default_rng(1).gamma(4, size=H.shape)
+    rng = np.random.default_rng(0)
+    drawn = rng.normal(size=(2, *H.shape))
+    shapes = np.random.default_rng(1).gamma(4, size=H.shape)
+    variance = 0.1 * shapes
     fits = [
         hj.fit_ldtp(
             hj.linear.HTF(

@@ -58,11 +58,13 @@ def test_the_hopper_is_identified_to_rounding(hopper, multipliers):
     )
     assert fit.compare(multipliers).max_error < 1e-13
     f = np.array([0.0, 0.3, 1.7, 16.0])
-    assert fit.htf(f).error(hopper.htf(f)).max() < 1e-12
+    error = fit.htf(f).error(hopper.htf(f))
+    assert error.max() < 1e-12
     np.testing.assert_allclose(
         fit.impulse_response(200), hopper.impulse_response(200), atol=1e-12
     )
-    assert fit.result == hj.errors.Result.OK and np.all(fit.noise < 1e-14)
+    assert fit.result == hj.errors.Result.OK
+    assert np.all(fit.noise < 1e-14)
 
 
 @settings(max_examples=6)
@@ -76,9 +78,12 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
     for k in range(2):
         section = (first + k) % N
         x0 = rng.normal(size=model.dims[section])
-        whole = record(model, 60 * N + 1 + k, seed + k, first_section=section, x0=x0)
-        whole.y[rng.random(whole.y.shape) < 0.02] = np.nan
-        whole.u[25 * N + 2, 0] = np.nan
+        length = 60 * N + 1 + k
+        whole = record(model, length, seed + k, first_section=section, x0=x0)
+        is_gap = rng.random(whole.y.shape) < 0.02
+        whole.y[is_gap] = np.nan
+        missing = 25 * N + 2
+        whole.u[missing, 0] = np.nan
         records.append(whole)
     fit = hj.fit_series(records, model)
     np.testing.assert_allclose(
@@ -92,15 +97,19 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
 
 def test_inputs_before_the_start_act_through_all_lags():
     """A register of one cycle beside a multiplier of 0.7; records begin in any section."""
-    A = np.diag([0.7**0.25, 0, 0, 0, 0]) + np.diag([0.0, 1, 1, 1], -1)
+    decay = np.diag([0.7**0.25, 0, 0, 0, 0])
+    chain = np.diag([0.0, 1, 1, 1], -1)
+    A = decay + chain
     B = np.array([[1.0], [1], [0], [0], [0]])
     C = np.array([[1.0, 0, 0, 0, 1]])
-    model = hj.linear.LDTP.from_blocks(*([x] * 4 for x in (A, B, C, np.zeros((1, 1)))))
+    blocks = [[x] * 4 for x in (A, B, C, np.zeros((1, 1)))]
+    model = hj.linear.LDTP.from_blocks(*blocks)
     data = [record(model, 240, k, first_section=k, x0=np.ones(5)) for k in range(1, 4)]
     rough = total_least_squares(late_outputs(problem_of(data, 1, 4), 1))
     fit = hj.fit_series(data, 1)
     np.testing.assert_allclose([rough, fit.coefficients], -0.7, atol=1e-9)
-    assert (found := hj.validate(fit, data)).white and found.fit.min() > 99.999
+    assert (found := hj.validate(fit, data)).white
+    assert found.fit.min() > 99.999
 
 
 def test_outputs_that_depend_on_later_inputs(small):
@@ -109,12 +118,15 @@ def test_outputs_that_depend_on_later_inputs(small):
     fit = hj.fit_series(
         hj.experiments.SectionSeries(data.u[:-2], data.y[2:], n_sections=4, lead=2), 2
     )
-    expected = np.roll(small.impulse_response(22), -2, axis=0)[:, 2:]
+    response = small.impulse_response(22)
+    ahead_response = np.roll(response, -2, axis=0)
+    expected = ahead_response[:, 2:]
     np.testing.assert_allclose(fit.impulse_response(20), expected, atol=1e-9)
     ahead = np.exp(1j * np.pi * (f + np.reshape(fit.htf(f).harmonics, (-1, 1))))[
         ..., None, None
     ]
-    np.testing.assert_allclose(fit.htf(f).H, ahead * small.htf(f).H, atol=1e-9)
+    expected_htf = ahead * small.htf(f).H
+    np.testing.assert_allclose(fit.htf(f).H, expected_htf, atol=1e-9)
 
 
 def test_regions_cover(small):
@@ -129,13 +141,15 @@ def test_regions_cover(small):
     distances = []
     noise = []
     for seed in range(runs):
-        fit = hj.fit_series(record(small, 4 * 120, seed, 0.3), 2)
+        data = record(small, 4 * 120, seed, 0.3)
+        fit = hj.fit_series(data, 2)
         hits += fit.contains(true).all()
         errors.append(fit.compare(true).error ** 2)
         variances.append(fit.standard_errors**2)
         noise.append(fit.noise)
         htf = fit.htf(f, (-1, 0, 1))
-        distances.append(np.abs(htf.H - exact.H) ** 2 / htf.variance)
+        square = np.abs(htf.H - exact.H) ** 2
+        distances.append(square / htf.variance)
     assert covered(hits, runs)
     rms = np.sqrt(np.mean(errors, axis=0))
     estimated = np.sqrt(np.mean(variances, axis=0))
@@ -168,14 +182,16 @@ def test_the_covariance_of_the_gradient_with_process_noise():
     rng = np.random.default_rng(0)
 
     def noise():
-        return 0.1 * np.asarray(model.simulate(rng.normal(size=(N * cycles, 1))))
+        white = rng.normal(size=(N * cycles, 1))
+        return 0.1 * np.asarray(model.simulate(white))
 
     estimated = 0.0
     measured = 0.0
     runs = 12
     for seed in range(runs):
         clean = record(model, N * cycles, seed)
-        problem = problem_of(with_outputs(clean, clean.y + noise()), 1, 12)
+        noisy = with_outputs(clean, clean.y + noise())
+        problem = problem_of(noisy, 1, 12)
         solution = linearize(problem, np.array([-true]))
         draws = (
             np.stack([noise() for _ in range(50)]).reshape(-1, cycles, N)
@@ -230,9 +246,11 @@ def test_an_order_that_is_too_low_is_noticed(small):
         with pytest.warns(FindingWarning, match=text) as caught:
             fit = hj.fit_series(data, 1)
         assert caught[0].filename == __file__
-        assert fit.findings[0].text in " ".join(repr(fit).split())
+        printed = " ".join(repr(fit).split())
+        assert fit.findings[0].text in printed
         assert "too low" in fit._repr_html_()
-        bent = with_outputs(data, data.y + 0.1 * data.y**2 / data.y.std())
+        curved = 0.1 * data.y**2 / data.y.std()
+        bent = with_outputs(data, data.y + curved)
         assert not hj.fit_series(bent, 2).findings
     design = hj.multisine(4, 8, amplitude=1.0).realizations(4)
     data = hj.experiments.simulate_experiments(small, design)
@@ -263,7 +281,8 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
         for data, guess in cases:
             with pytest.warns(FindingWarning, match="Drift: outputs may drift"):
                 multipliers = fit(data, guess).multipliers
-            assert np.abs(multipliers - small.multipliers[0]).max() > 0.1
+            apart = np.abs(multipliers - small.multipliers[0])
+            assert apart.max() > 0.1
     first = mock.Mock(wraps=subspace_model)
     monkeypatch.setattr("hybridjax.identify.joint.fit.subspace_model", first)
     for data in (
@@ -280,9 +299,11 @@ def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     with pytest.raises(
         hj.errors.DefinitionError, match="not 2.*outputs may drift: `with_drift"
     ):
-        hj.fit_series(moved(3 * slow.repeat(4), seed=0), 2)
+        drifting = moved(3 * slow.repeat(4), seed=0)
+        hj.fit_series(drifting, 2)
     (begun,) = with_drift([record(small, 4100)])  # (Longer ones take too long.)
-    assert (len(begun.u), begun.drift, with_drift([begun])) == (4000, 20, [])
+    found = (len(begun.u), begun.drift, with_drift([begun]))
+    assert found == (4000, 20, [])
 
 
 def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
@@ -291,9 +312,11 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
     C = np.array([[0.1, 0.5]])
     D = np.zeros((1, 1))
     for multiplier, late in (0.98, 0), (1.0, 50):
-        model = hj.linear.LDTP.from_blocks([np.diag([multiplier, -0.7])], [B], [C], [D])
+        A = np.diag([multiplier, -0.7])
+        model = hj.linear.LDTP.from_blocks([A], [B], [C], [D])
         data = record(model, 400, noise=0.2)
-        signals = (np.pad(x, ((late, 0), (0, 0))) for x in (data.u, data.y))
+        before = ((late, 0), (0, 0))
+        signals = (np.pad(x, before) for x in (data.u, data.y))
         fit = hj.fit_series(
             hj.experiments.SectionSeries(*signals, n_sections=1), 2, check=False
         )
@@ -304,7 +327,9 @@ def test_inputs_that_begin_after_the_trial_of_a_drift(monkeypatch):
 def test_how_far_another_fit_contradicts():
     """By 1, 2.5 and 4 standard errors: an order does at 95 %, a drift at 99.9 %."""
     covariance = np.array([[0.01]]), np.inf
-    fit = MultiplierEstimate(np.array([0.5 + 0j]), np.array([-0.5]), *covariance)
+    root = np.array([0.5 + 0j])
+    coefficient = np.array([-0.5])
+    fit = MultiplierEstimate(root, coefficient, *covariance)
     others = [
         [lambda c=c: (np.array([c]), lambda: covariance)] for c in (-0.6, -0.75, -0.9)
     ]
@@ -323,8 +348,11 @@ def test_announced_drift_is_removed(small):
     cycle = n // 4 + 0.5
     section = n % 4
     plain = record(small, 4 * T, noise=0.1, drift=50)
-    wave = 5 * np.cos(np.pi * 3 * cycle / T) * np.cos(section) + 7
-    moved = with_outputs(plain, plain.y + wave[:, None])
+    phase = np.pi * 3 * cycle / T
+    slow = np.cos(phase)
+    wave = 5 * slow * np.cos(section) + 7
+    moved_outputs = plain.y + wave[:, None]
+    moved = with_outputs(plain, moved_outputs)
     without = hj.fit_series(plain, 2)
     fit = hj.fit_series(moved, 2)
     np.testing.assert_allclose(fit.coefficients, without.coefficients, atol=1e-6)
@@ -380,7 +408,9 @@ def test_absolute_outputs_are_refused(small):
     ):
         with pytest.raises(hj.errors.DefinitionError, match="subtract the limit cycle"):
             door(*arguments)
-    assert hj.estimate_htf(good).error(small.htf([0.25, 1.0])).max() < 1e-9
+    estimated = hj.estimate_htf(good)
+    error = estimated.error(small.htf([0.25, 1.0]))
+    assert error.max() < 1e-9
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e9])
@@ -397,7 +427,8 @@ def test_inputs_have_units_of_their_own(unit):
         for v in (u, u * units)
     ]
     htfs = [fit.htf([0.3]).H for fit in fits]
-    np.testing.assert_allclose(htfs[1] * units, htfs[0], rtol=1e-6)
+    in_units = htfs[1] * units
+    np.testing.assert_allclose(in_units, htfs[0], rtol=1e-6)
     found = [fit.model.multipliers for fit in fits]
     np.testing.assert_allclose(*found, rtol=1e-6)
     design = hj.multisine(4, 8, lines="odd", inputs=2, division="disjoint")
@@ -431,8 +462,11 @@ def test_a_multiplier_that_changes_along_the_data_is_named():
             x = np.zeros(161)
             for i in range(160):
                 # Two sections in a period.
-                x[i + 1] = (z if i % 2 else 1.0) * x[i] + u[i, 0]
-            y = x[:160, None] + 0.1 * rng.normal(size=(160, 1))
+                factor = z if i % 2 else 1.0
+                carried = factor * x[i]
+                x[i + 1] = carried + u[i, 0]
+            noise = 0.1 * rng.normal(size=(160, 1))
+            y = x[:160, None] + noise
             each.append(hj.experiments.SectionSeries(u, y, n_sections=2))
         return each
 

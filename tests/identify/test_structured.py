@@ -19,7 +19,8 @@ def test_the_hopper_is_found_exactly(harmonics, exact, multipliers):
 
 
 def test_the_paper_protocol(paper_estimate, multipliers):
-    narrow = hj.fit_multipliers(paper_estimate.select((-2, -1, 0, 1, 2)), 2)
+    five = paper_estimate.select((-2, -1, 0, 1, 2))
+    narrow = hj.fit_multipliers(five, 2)
     assert narrow.compare(multipliers).max_error < 2e-5
 
 
@@ -28,11 +29,17 @@ def test_the_paper_protocol(paper_estimate, multipliers):
 def test_random_systems(shape, seed):
     """The state beyond the rank dies within one period, as dimensions fall to 2 or less."""
     dims, ny, nu = shape
-    model = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu, gain=0.95))
+    blocks = blocks_at_random(seed, dims, ny, nu, gain=0.95)
+    model = hj.linear.LDTP.from_blocks(*blocks)
     N = len(dims)
-    htf = model.htf(np.linspace(0.01, N / 2 - 0.01, 12 * N))
+    last = N / 2 - 0.01
+    f = np.linspace(0.01, last, 12 * N)
+    htf = model.htf(f)
     fit = hj.fit_multipliers(htf, model)
     true = model.multipliers
-    assert_allclose(fit.coefficients, np.poly(true).real[1:], atol=1e-8)
-    assert fit.htf(htf.frequencies).error(htf).max() < 1e-8
-    assert fit.numerators.shape == (N, 3 * N + 1, ny, nu)
+    exact = np.poly(true).real[1:]
+    assert_allclose(fit.coefficients, exact, atol=1e-8)
+    error = fit.htf(htf.frequencies).error(htf)
+    assert error.max() < 1e-8
+    lags = 3 * N + 1
+    assert fit.numerators.shape == (N, lags, ny, nu)

@@ -23,7 +23,9 @@ def noisy(htf, variance, rng, correlation=0.0):
     ]
     own = parts[0]
     common = parts[1][:1, :, :1]
-    error = np.sqrt(1 - correlation) * own + np.sqrt(correlation) * common
+    of_own = np.sqrt(1 - correlation) * own
+    of_common = np.sqrt(correlation) * common
+    error = of_own + of_common
     return with_variance(
         htf, np.asarray(htf.H) + np.sqrt(variance / 2) * error, variance
     )
@@ -45,9 +47,12 @@ def small():
 def variance(small):
     """Not the same for all frequencies, harmonics and outputs."""
     rng = np.random.default_rng(9)
-    harmonic = np.array([1.0, 0.3, 2.0, 0.3])[:, None, None, None]
-    line = 10 ** rng.uniform(-0.5, 0.5, 80)[:, None, None]
-    return 1e-2 * harmonic * line * np.array([1.0, 3.0])[:, None]
+    sizes = np.array([1.0, 0.3, 2.0, 0.3])
+    harmonic = sizes[:, None, None, None]
+    exponents = rng.uniform(-0.5, 0.5, 80)
+    line = 10 ** exponents[:, None, None]
+    outputs = np.array([1.0, 3.0])
+    return 1e-2 * harmonic * line * outputs[:, None]
 
 
 def covered(hits, runs, level=0.95):
@@ -68,14 +73,18 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
         noisy(htf, variance, np.random.default_rng(k), correlation) for k in range(runs)
     )
     fits = [hj.fit_multipliers(draw, 2, covariance=errors) for draw in draws]
-    assert covered(sum(fit.contains(true).all() for fit in fits), runs)
-    rms = np.sqrt(np.mean([fit.compare(true).error ** 2 for fit in fits], axis=0))
-    said = np.sqrt(np.mean([fit.standard_errors**2 for fit in fits], axis=0))
+    hits = sum(fit.contains(true).all() for fit in fits)
+    assert covered(hits, runs)
+    squares = [fit.compare(true).error ** 2 for fit in fits]
+    rms = np.sqrt(np.mean(squares, axis=0))
+    variances = [fit.standard_errors**2 for fit in fits]
+    said = np.sqrt(np.mean(variances, axis=0))
     np.testing.assert_allclose(said, rms, rtol=0.25)
     if not correlation:
         np.testing.assert_allclose(rms, bound, rtol=0.25)
         dof = np.sqrt(2 * fits[0].dof * runs)
-        assert abs(sum(fit.cost - fit.dof for fit in fits)) < 4 * dof
+        excess = sum(fit.cost - fit.dof for fit in fits)
+        assert abs(excess) < 4 * dof
 
 
 def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
@@ -85,10 +94,13 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
         rng = np.random.default_rng(seed)
         data = noisy(htf, variance, rng)
         rough = variance * rng.gamma(2.0, 0.5, variance.shape)
-        fit = hj.fit_multipliers(with_variance(htf, data.H, rough, np.full(80, 2.0)), 2)
+        dof_of_each = np.full(80, 2.0)
+        estimated = with_variance(htf, data.H, rough, dof_of_each)
+        fit = hj.fit_multipliers(estimated, 2)
         raw = hj.fit_multipliers(with_variance(htf, data.H, rough), 2)
         square += [f.compare(model.multipliers).error[0] ** 2 for f in (fit, raw)]
-    bound = hj.identify.cramer_rao(model, with_variance(htf, htf.H, variance))
+    exact = with_variance(htf, htf.H, variance)
+    bound = hj.identify.cramer_rao(model, exact)
     ratio = np.sqrt(square / 25) / bound.standard_errors[0]
     assert ratio[0] < 1.2 < ratio[1]
 
@@ -96,7 +108,8 @@ def test_variances_from_few_experiments_are_good_enough_weights(small, variance)
 def test_without_variances_the_misfit_tells(small):
     """One output is a hundred times as noisy, which nobody said."""
     model, htf = small
-    variance = np.broadcast_to(np.array([1e-2, 1.0])[:, None], htf.H.shape)
+    by_output = np.array([1e-2, 1.0])
+    variance = np.broadcast_to(by_output[:, None], htf.H.shape)
     said = hj.identify.cramer_rao(
         model, with_variance(htf, htf.H, variance)
     ).standard_errors
@@ -111,19 +124,30 @@ def test_the_spectrum_of_errors_is_found(small):
     model, htf = small
     f = np.asarray(htf.frequencies)
     c = np.poly(model.multipliers).real[1:]
-    chi = np.polyval(np.append(1, c)[::-1], np.exp(-2j * np.pi * f))
-    true = np.array([3e-3, 1e-2]) + np.array([1e-2, 2e-3]) / np.abs(chi[:, None]) ** 2
-    supposed = weights_of(np.linspace(1e-3, 4e-3, 160).reshape(80, 2, 1), np.ones(2))
+    polynomial = np.append(1, c)[::-1]
+    delay = np.exp(-2j * np.pi * f)
+    chi = np.polyval(polynomial, delay)
+    white = np.array([3e-3, 1e-2])
+    colored = np.array([1e-2, 2e-3])
+    gain = np.abs(chi[:, None]) ** 2
+    true = white + colored / gain
+    line = np.linspace(1e-3, 4e-3, 160)
+    guessed = line.reshape(80, 2, 1)
+    supposed = weights_of(guessed, np.ones(2))
     supposed = np.broadcast_to(supposed, htf.H.shape)
-    lines = np.random.default_rng(0).uniform(0.1, 2, (80, 1, htf.H.shape[3]))
-    variance = np.broadcast_to(true[..., None] * lines, htf.H.shape)
+    rng = np.random.default_rng(0)
+    inputs = htf.H.shape[3]
+    lines = rng.uniform(0.1, 2, (80, 1, inputs))
+    by_line = true[..., None] * lines
+    variance = np.broadcast_to(by_line, htf.H.shape)
     found = []
     for seed in range(50):
         groups = group_htf(
             noisy(htf, variance, np.random.default_rng(seed)), supposed, 13
         )
         found.append(error_spectrum(groups, c, f, lines, 2))
-    np.testing.assert_allclose(np.mean(found, axis=0), variance[0], rtol=0.06)
+    mean = np.mean(found, axis=0)
+    np.testing.assert_allclose(mean, variance[0], rtol=0.06)
 
 
 @pytest.fixture(scope="module")
@@ -145,25 +169,32 @@ def test_first_order_covariances_and_regions(pair_and_real):
     np.testing.assert_allclose(multipliers_of(c), true, rtol=1e-12)  # in this order
     draws = rng.multivariate_normal(c, estimate.covariance, size=2000)
     roots = np.array([np.roots([1, *draw]) for draw in draws])
-    pick = np.argmin(np.abs(roots[:, :, None] - true), axis=1)
+    distances = np.abs(roots[:, :, None] - true)
+    pick = np.argmin(distances, axis=1)
     roots = np.take_along_axis(roots, pick, axis=1)
     for i in range(3):
-        parts = np.stack([roots[:, i].real, roots[:, i].imag])
+        real = roots[:, i].real
+        imaginary = roots[:, i].imag
+        parts = np.stack([real, imaginary])
         found = estimate.multiplier_covariances[i]
         np.testing.assert_allclose(np.cov(parts), found, rtol=0.1, atol=1e-7)
-    radius = np.sqrt(np.mean(np.abs(roots - true) ** 2, axis=0))
+    squares = np.abs(roots - true) ** 2
+    radius = np.sqrt(np.mean(squares, axis=0))
     np.testing.assert_allclose(estimate.standard_errors, radius, rtol=0.05)
     # The border of the first-order region has the distance of the exact one.
     for i, degrees, dof in ((0, 2, 1e9), (2, 1, 1e9), (0, 2, 9), (2, 1, 9)):
         border = dataclasses.replace(estimate, covariance_dof=dof).ellipse(i, 0.9)
         if degrees == 1:
-            border = border[[np.argmin(border.real), np.argmax(border.real)]].real
+            ends = [np.argmin(border.real), np.argmax(border.real)]
+            border = border[ends].real
         left = dof - degrees + 1  # Hotelling's distribution
-        quantile = degrees * dof / left * stats.f(degrees, left).ppf(0.9)
+        ratio = stats.f(degrees, left).ppf(0.9)
+        quantile = degrees * dof / left * ratio
         np.testing.assert_allclose(estimate.distance(border), quantile, rtol=0.05)
     # The share of draws that a region around the truth holds.
     held = [
         MultiplierEstimate(true, draw, estimate.covariance, np.inf).contains(true)
         for draw in draws
     ]
-    assert np.all([covered(n, 2000) for n in np.sum(held, axis=0)])
+    hits = np.sum(held, axis=0)
+    assert np.all([covered(n, 2000) for n in hits])

@@ -20,7 +20,9 @@ def test_the_true_model_leaves_white_noise(small):
     correlations = []
     for seed in range(30):
         data = record(small, 4 * 100, seed, 0.3, first_section=1, x0=np.ones(3))
-        data.y[np.random.default_rng(seed).random(data.y.shape) < 0.02] = np.nan
+        rng = np.random.default_rng(seed)
+        is_gap = rng.random(data.y.shape) < 0.02
+        data.y[is_gap] = np.nan
         found = hj.validate(small, data)
         p.append([found.whiteness, found.independence])
         other = record(small, 4 * 60, 100 + seed, 0.3)
@@ -28,10 +30,13 @@ def test_the_true_model_leaves_white_noise(small):
             found = hj.validate(fit, data)
             of_fits.append([found.whiteness, found.independence])
             correlations.append(found.cross_correlation)
-    for test in np.reshape(p, (30, 2, 2)).transpose(1, 2, 0).reshape(4, 30):
+    by_seed = np.reshape(p, (30, 2, 2))
+    for test in by_seed.transpose(1, 2, 0).reshape(4, 30):
         assert stats.kstest(test, "uniform").pvalue > 1e-3
-    assert covered(int((np.array(p) > 0.05).sum()), 120)
-    np.testing.assert_allclose(np.mean(np.square(correlations)), 1, atol=0.15)
+    accepted = int((np.array(p) > 0.05).sum())
+    assert covered(accepted, 120)
+    mean_square = np.mean(np.square(correlations))
+    np.testing.assert_allclose(mean_square, 1, atol=0.15)
     for test in np.swapaxes(of_fits, 0, 1):
         assert covered(int((test > 0.05).sum()), 120)
 
@@ -41,10 +46,13 @@ def test_the_fit_is_the_share_explained(small):
     found = hj.validate(small, data, start="cycle")
     clean = np.asarray(small.simulate(data.u))
     np.testing.assert_allclose(found.simulated, clean, atol=1e-12)
-    left = np.sqrt(np.mean((data.y - clean) ** 2, axis=0))
+    squares = (data.y - clean) ** 2
+    left = np.sqrt(np.mean(squares, axis=0))
     np.testing.assert_allclose(found.noise, left)
-    np.testing.assert_allclose(found.fit, 100 * (1 - left / data.y.std(axis=0)))
-    assert found.white and "independence of the input not rejected" in repr(found)
+    shares = 1 - left / data.y.std(axis=0)
+    np.testing.assert_allclose(found.fit, 100 * shares)
+    assert found.white
+    assert "independence of the input not rejected" in repr(found)
 
 
 def test_a_wrong_model_is_refused(small):
@@ -52,17 +60,18 @@ def test_a_wrong_model_is_refused(small):
     found = hj.validate(
         eqx.tree_at(lambda m: m.B, small, small.B.at[2].multiply(1.3)), data
     )
-    assert (
-        found.independence.min() < 1e-6
-        and "independence of the input rejected" in repr(found)
-    )
-    turned = hj.validate(eqx.tree_at(lambda m: m.C, small, -small.C), data)
+    assert found.independence.min() < 1e-6
+    assert "independence of the input rejected" in repr(found)
+    wrong = eqx.tree_at(lambda m: m.C, small, -small.C)
+    turned = hj.validate(wrong, data)
     assert "no better than by the mean cycle: y0, y1" in repr(turned)
     with pytest.raises(
         hj.errors.DefinitionError, match="unstable plant grows without bound"
     ):
-        hj.validate(eqx.tree_at(lambda m: m.A, small, 9 * small.A), data)
-    low = hj.fit_series(record(small, 4 * 300, 1, 0.1), 1, extra_lags=0, check=False)
+        unstable = eqx.tree_at(lambda m: m.A, small, 9 * small.A)
+        hj.validate(unstable, data)
+    data_of_low = record(small, 4 * 300, 1, 0.1)
+    low = hj.fit_series(data_of_low, 1, extra_lags=0, check=False)
     assert not hj.validate(low, data).independent
 
 
@@ -74,11 +83,17 @@ def test_a_misfit_that_is_called_visible_is_noticed_in_four_of_five_data(small):
     for seed in range(runs):
         data = record(small, N * 80, seed, 0.5)
         rng = np.random.default_rng(1000 + seed)
-        hidden = rng.choice([-1.0, 1.0], N)[np.arange(N * 80) % N] * data.u[:, 0]
-        size = np.sqrt(np.mean(np.asarray(small.simulate(data.u))[:, 1] ** 2))
+        signs = rng.choice([-1.0, 1.0], N)
+        section = np.arange(N * 80) % N
+        hidden = signs[section] * data.u[:, 0]
+        outputs = np.asarray(small.simulate(data.u))
+        response = outputs[:, 1]
+        size = np.sqrt(np.mean(response**2))
         found = hj.validate(small, data)
-        data.y[:, 1] += found.visible[1] * size * hidden / np.sqrt(np.mean(hidden**2))
-        noticed += hj.validate(small, data).independence[1] < found.alpha / 2
+        hidden_size = np.sqrt(np.mean(hidden**2))
+        data.y[:, 1] += found.visible[1] * size * hidden / hidden_size
+        p_value = hj.validate(small, data).independence[1]
+        noticed += p_value < found.alpha / 2
     assert covered(noticed, runs, 0.8)
     assert "detectable with 80 % power: " in repr(found)
     few, more = (
@@ -92,9 +107,18 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     """Neither residuals nor p-values of the true model change, however large the drift is."""
     plain = record(small, 4 * 150, 0, 0.3, first_section=1)
     plain.y[5:9, 0] = np.nan
-    cycle = ((1 + np.arange(4 * 150)) // 4 + 0.5) / 151
-    wave = 9 * np.cos(np.pi * 3 * cycle) * np.cos(np.arange(4 * 150) % 4) + 7
-    about = dict(n_sections=4, first_section=1, outputs=plain.outputs, drift=50)
+    whole_cycles = (1 + np.arange(4 * 150)) // 4
+    cycle = (whole_cycles + 0.5) / 151
+    slow = np.cos(np.pi * 3 * cycle)
+    sections = np.arange(4 * 150) % 4
+    by_section = np.cos(sections)
+    wave = 9 * slow * by_section + 7
+    about = dict(
+        n_sections=4,
+        first_section=1,
+        outputs=plain.outputs,
+        drift=50,
+    )
     drift = wave[:, None] * [1.0, -2.0]
     records = (
         hj.experiments.SectionSeries(plain.u, plain.y + k * drift, **about)
@@ -103,7 +127,8 @@ def test_announced_drift_is_taken_out_of_models_and_fits_alike(small, start):
     still, moved = (hj.validate(small, x, start=start) for x in records)
     np.testing.assert_allclose(moved.noise, still.noise, rtol=1e-3)
     np.testing.assert_allclose(moved.whiteness, still.whiteness, rtol=0.05)
-    assert moved.white and moved.independent
+    assert moved.white
+    assert moved.independent
     np.testing.assert_allclose(still.noise, 0.3, rtol=0.1)
     unsaid = hj.experiments.SectionSeries(
         plain.u, plain.y + wave[:, None], **dict(about, drift=None)
@@ -116,14 +141,17 @@ def test_records_shorter_than_the_lags(small):
     whole = record(small, 4 * 100, 0, 0.3)
     pieces = [whole.part(0, 103), whole.part(103, 106), whole.part(106, 400)]
     found = hj.validate(small, pieces)
-    assert found.left_out == 1 and "compare, left out: 1\n" in repr(found)
+    assert found.left_out == 1
+    assert "compare, left out: 1\n" in repr(found)
     np.testing.assert_array_equal(found.measured, whole.y[106:])
-    assert found.white and found.independent
+    assert found.white
+    assert found.independent
     assert hj.validate(small, pieces, start="cycle").left_out == 0
     with pytest.raises(
         hj.errors.DefinitionError, match="0.75 cycles without gaps are too few"
     ):
-        hj.validate(small, [whole.part(0, 3), whole.part(3, 6)])
+        halves = [whole.part(0, 3), whole.part(3, 6)]
+        hj.validate(small, halves)
     with pytest.raises(hj.errors.DefinitionError, match="^u is zero or missing"):
         hj.validate(
             small,
@@ -132,7 +160,8 @@ def test_records_shorter_than_the_lags(small):
             ),
         )
     many = [whole.part(k, k + 2) for k in range(0, 400, 2)]
-    assert hj.validate(small, many, start="cycle").autocorrelation.shape[1] == 1
+    validation = hj.validate(small, many, start="cycle")
+    assert validation.autocorrelation.shape[1] == 1
 
 
 def test_nothing_is_simulated_beyond_the_known_inputs(small):

@@ -12,7 +12,8 @@ def blocks_at_random(seed, dims, ny, nu, gain=0.7):
     A = [gain * a / np.linalg.norm(a, 2) for a in A]
     B = [rng.normal(size=(d, nu)) for d in after]
     C = [rng.normal(size=(ny, d)) for d in dims]
-    return A, B, C, [rng.normal(size=(ny, nu)) for _ in dims]
+    D = [rng.normal(size=(ny, nu)) for _ in dims]
+    return A, B, C, D
 
 
 def simulate_blocks(blocks, u, x0, start=0):
@@ -23,8 +24,10 @@ def simulate_blocks(blocks, u, x0, start=0):
     ys = []
     for i, value in enumerate(u):
         n = (start + i) % len(A)
-        ys.append(C[n] @ x + D[n] @ value)
-        x = A[n] @ x + B[n] @ value
+        output = C[n] @ x + D[n] @ value
+        ys.append(output)
+        forced = B[n] @ value
+        x = A[n] @ x + forced
         xs.append(x)
     return xs, np.array(ys)
 

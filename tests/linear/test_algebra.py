@@ -40,22 +40,32 @@ def lifted(ldtp, z):
     x = everything[:n]
     outputs = []
     for k in range(N):
-        u = everything[n + k * nu : n + (k + 1) * nu]
-        outputs.append(C[k] @ x + D[k] @ u)
-        x = A[k] @ x + B[k] @ u
+        first = n + k * nu
+        after = n + (k + 1) * nu
+        u = everything[first:after]
+        output = C[k] @ x + D[k] @ u
+        outputs.append(output)
+        forced = B[k] @ u
+        x = A[k] @ x + forced
     y = np.concatenate(outputs)
-    resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - x[:, :n])
-    return y[:, :n] @ resolvent @ x[:, n:] + y[:, n:]
+    shift = z[:, None, None] * np.eye(n)
+    of_state = x[:, :n]
+    resolvent = np.linalg.inv(shift - of_state)
+    by_state = y[:, :n] @ resolvent @ x[:, n:]
+    return by_state + y[:, n:]
 
 
 @pytest.fixture(scope="module")
 def pair():
-    return system(0, (3, 2, 4, 1)), system(1, (1, 2, 1, 3), OUT, IN, 0.1)
+    plant = system(0, (3, 2, 4, 1))
+    controller = system(1, (1, 2, 1, 3), OUT, IN, 0.1)
+    return plant, controller
 
 
 def test_systems_against_lifted_ones(pair):
     P, K = pair
-    z = np.exp(2j * np.pi * np.array([0.0, 0.17, 0.5]))
+    f = np.array([0.0, 0.17, 0.5])
+    z = np.exp(2j * np.pi * f)
     plant = lifted(P, z)
     controller = lifted(K, z)
     one = np.eye(2 * N)
@@ -74,7 +84,8 @@ def test_systems_against_lifted_ones(pair):
     assert P.feedback(K).inputs == tuple(IN)
     assert (P @ K).inputs == tuple(OUT)
     assert (P @ K).outputs == tuple(OUT)
-    inside = eqx.filter_jit(lambda P, K: P.feedback(K).htf(0.3).H)(P, K)
+    program = eqx.filter_jit(lambda P, K: P.feedback(K).htf(0.3).H)
+    inside = program(P, K)
     assert_allclose(inside, P.feedback(K).htf(0.3).H, rtol=0, atol=1e-12)
 
 
@@ -110,7 +121,8 @@ def test_variances_are_those_of_draws(operation, pair):
 
     def draws(htf):
         parts = rng.normal(size=(200, *htf.H.shape, 2))
-        noise = size / np.sqrt(2) * (parts @ [1, 1j])
+        draws = parts @ [1, 1j]
+        noise = size / np.sqrt(2) * draws
         return np.asarray(htf.H) + noise
 
     def with_variance(htf):
@@ -124,7 +136,8 @@ def test_variances_are_those_of_draws(operation, pair):
         noisy_G = eqx.tree_at(lambda htf: htf.H, G, G_draw)
         return operation(noisy_H, noisy_G).H
 
-    error = np.asarray(results(draws(H), draws(G))) - operation(H, G).H
+    drawn = np.asarray(results(draws(H), draws(G)))
+    error = drawn - operation(H, G).H
     scatter = np.mean(np.abs(error) ** 2, axis=0)
     variance = operation(with_variance(H), with_variance(G)).variance
     ratio = scatter / np.asarray(variance)
@@ -140,7 +153,8 @@ def test_what_does_not_fit_is_refused(pair):
         return pytest.raises(hj.errors.DefinitionError, match=text)
 
     with refused(r"'y' \(m\).*'y' \(mm\)"):
-        P.feedback(system(1, (1, 2, 1, 3), {"y": "mm", "v": ""}, IN))
+        other_units = system(1, (1, 2, 1, 3), {"y": "mm", "v": ""}, IN)
+        P.feedback(other_units)
     with refused("are not the inputs"):
         P @ P
     with refused("different n_sections"):
@@ -148,10 +162,13 @@ def test_what_does_not_fit_is_refused(pair):
     with refused("needs a square and invertible D"):
         system(2, (2, 2, 2, 2), through=0).inverse()
     with refused("answers itself at section 2"):
-        eqx.tree_at(lambda x: x.D, K, K.D.at[2].set(-np.linalg.inv(P.D[2]))).feedback(P)
+        inverse = np.linalg.inv(P.D[2])
+        blocking = K.D.at[2].set(-inverse)
+        eqx.tree_at(lambda x: x.D, K, blocking).feedback(P)
     with refused(r"of shape \(2 inputs, 2 outputs\) or of shape \(4 sections"):
         P.feedback(np.eye(3))
     with refused("do not hold f = 1.3"):
         P.htf([0.3, 0.7]).inverse()
     with refused("needs all 4 harmonics"):
-        P.htf(F, (0, 1)) @ K.htf(F, (0, 1))
+        of_plant = P.htf(F, (0, 1))
+        of_plant @ K.htf(F, (0, 1))

@@ -36,7 +36,9 @@ def test_three_ways_agree(seed, shape, f):
     # The Fourier series of the impulse response, y[n] = sum_r h[n, r] u[n-r].
     omega = 2 * np.pi * f / N
     h = np.asarray(ldtp.impulse_response(120))
-    G = np.einsum("nrij,r->nij", h, np.exp(-1j * omega * np.arange(120)))
+    times = np.arange(120)
+    delays = np.exp(-1j * omega * times)
+    G = np.einsum("nrij,r->nij", h, delays)
     fourier = np.exp(-2j * np.pi * np.outer(m, np.arange(N)) / N) / N
     expected = np.einsum("mn,nij->mij", fourier, G)
     assert_allclose(H, expected, rtol=0, atol=1e-12)
@@ -47,13 +49,19 @@ def test_three_ways_agree(seed, shape, f):
     channel = seed % nu
     n = np.arange((transient + periods) * N)
     u = np.zeros((len(n), nu))
-    u[:, channel] = np.cos(omega * n + 0.3)
-    _, y = simulate_blocks(blocks, u, np.zeros(dims[0]))
-    Y = np.fft.fft(y[transient * N :], axis=0)
-    U = np.fft.fft(u[transient * N :, channel])
+    wave = np.cos(omega * n + 0.3)
+    u[:, channel] = wave
+    rest = np.zeros(dims[0])
+    _, y = simulate_blocks(blocks, u, rest)
+    steady_output = y[transient * N :]
+    Y = np.fft.fft(steady_output, axis=0)
+    steady = u[transient * N :, channel]
+    U = np.fft.fft(steady)
     line = round(f * periods)
     lines = (line + m * periods) % (periods * N)
-    assert_allclose(H[:, :, channel], Y[lines] / U[line], rtol=0, atol=1e-12)
+    found = H[:, :, channel]
+    by_spectra = Y[lines] / U[line]
+    assert_allclose(found, by_spectra, rtol=0, atol=1e-12)
 
 
 @settings(max_examples=4)
@@ -62,20 +70,24 @@ def test_prediction_is_the_periodic_response(seed, shape):
     dims, ny, nu = shape
     N = len(dims)
     periods = 4
-    ldtp = hj.linear.LDTP.from_blocks(*blocks_at_random(seed, dims, ny, nu))
+    blocks = blocks_at_random(seed, dims, ny, nu)
+    ldtp = hj.linear.LDTP.from_blocks(*blocks)
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(periods * N, nu))
     start = ldtp.periodic_state(u, periods)
     expected = ldtp.simulate(u, start)
     # Negative frequencies follow by symmetry.
-    f = np.arange(periods * N // 2 + 1) / periods
-    assert_allclose(ldtp.htf(f).predict(u), expected, rtol=0, atol=1e-11)
+    lines = np.arange(periods * N // 2 + 1)
+    f = lines / periods
+    predicted = ldtp.htf(f).predict(u)
+    assert_allclose(predicted, expected, rtol=0, atol=1e-11)
 
 
 def test_derivatives_by_matrices_and_frequencies(synthetic):
     @jax.jit
     def values(A, B, C, D, f):
-        htf = hj.linear.LDTP(A, B, C, D).htf(f, harmonics=(-3, 0, 1))
+        model = hj.linear.LDTP(A, B, C, D)
+        htf = model.htf(f, harmonics=(-3, 0, 1))
         return jnp.stack([htf.H.real, htf.H.imag])
 
     f = np.array([0.4, 1.7])
@@ -85,7 +97,8 @@ def test_derivatives_by_matrices_and_frequencies(synthetic):
 
 def test_a_prediction_has_derivatives_by_the_htf(synthetic):
     htf = synthetic.htf([0.5])
-    wave = np.cos(2 * np.pi * 0.5 * np.arange(12) / 6)
+    angle = 2 * np.pi * 0.5 * np.arange(12) / 6
+    wave = np.cos(angle)
     u = np.stack([wave, wave], axis=1)
 
     @jax.jit
@@ -99,7 +112,9 @@ def test_a_prediction_has_derivatives_by_the_htf(synthetic):
     step = np.zeros(htf.H.shape)
     step[entry] = h
     H = np.asarray(htf.H)
-    difference = (loss(H + step) - loss(H - step)) / (2 * h)
+    higher = loss(H + step)
+    change = higher - loss(H - step)
+    difference = change / (2 * h)
     assert_allclose(difference, gradient[entry].real, rtol=1e-6)
 
 
@@ -108,7 +123,8 @@ def test_a_multiplier_on_the_unit_circle_is_named():
     B = np.ones((2, 1))
     C = np.ones((1, 2))
     ldtp = hj.linear.LDTP.from_blocks([turn] * 3, [B] * 3, [C] * 3)
-    resonance = 3 * np.arctan2(0.8, 0.6) / (2 * np.pi)
+    angle = np.arctan2(0.8, 0.6)
+    resonance = 3 * angle / (2 * np.pi)
     beside = ldtp.htf([0.1, resonance + 1e-6])
     assert np.all(np.isfinite(beside.H))
     with pytest.raises(
@@ -129,4 +145,5 @@ def test_frequencies_are_given_once():
     with pytest.raises(
         hj.errors.DefinitionError, match="`frequencies` holds 0.1 .* twice"
     ):
-        hj.linear.HTF([0.1, 0.1], np.ones((1, 2, 1, 1)), 0, 4)
+        values = np.ones((1, 2, 1, 1))
+        hj.linear.HTF([0.1, 0.1], values, 0, 4)

@@ -43,7 +43,8 @@ def test_periodic_state_of_an_unstable_system():
     # A^20 has the entries 1e20 and 1e-20; the stable part must not drown.
     A = np.array([[10.0, 0.0], [3.0, 0.1]])
     B = np.ones((2, 1))
-    ldtp = hj.linear.LDTP.from_blocks([A], [B], [np.eye(2)])
+    C = np.eye(2)
+    ldtp = hj.linear.LDTP.from_blocks([A], [B], [C])
     rng = np.random.default_rng(0)
     u = rng.normal(size=(20, 1))
     # One linear system for the states of all periods: x[k+1] = A x[k] + B u[k], cyclically.
@@ -51,7 +52,8 @@ def test_periodic_state_of_an_unstable_system():
     states = np.linalg.solve(
         np.eye(40) - np.kron(next_period, A), np.kron(next_period, B) @ u[:, 0]
     )
-    assert_allclose(ldtp.periodic_state(u, 20), states[:2], rtol=1e-12)
+    periodic = ldtp.periodic_state(u, 20)
+    assert_allclose(periodic, states[:2], rtol=1e-12)
 
 
 def test_jit_vmap_and_gradients(synthetic):
@@ -60,10 +62,13 @@ def test_jit_vmap_and_gradients(synthetic):
     assert_allclose(
         eqx.filter_jit(hj.linear.LDTP.simulate)(synthetic, u), plain, atol=1e-14
     )
-    many = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
-    assert_allclose(many, np.stack([plain, 2 * plain]), atol=1e-13)
+    inputs = np.stack([u, 2 * u])
+    many = jax.vmap(synthetic.simulate)(inputs)
+    expected = np.stack([plain, 2 * plain])
+    assert_allclose(many, expected, atol=1e-13)
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
-    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
+    direct = batch.D.at[1].set(0.0)
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, direct)
     many = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
     assert_allclose(many[0], plain, atol=1e-14)
     assert not np.allclose(many[1], plain)
@@ -73,7 +78,9 @@ def test_jit_vmap_and_gradients(synthetic):
         ldtp = hj.linear.LDTP(
             s * synthetic.A, synthetic.B, synthetic.C, synthetic.D, synthetic.dims
         )
-        return jnp.concatenate([ldtp.simulate(u)[-1], ldtp.periodic_state(u, 3)])
+        end = ldtp.simulate(u)[-1]
+        periodic = ldtp.periodic_state(u, 3)
+        return jnp.concatenate([end, periodic])
 
     jax.test_util.check_grads(scaled, (0.9,), order=1, modes=("rev",), eps=1e-6)
 
@@ -84,12 +91,15 @@ def test_jit_and_vmap(synthetic):
     plain = synthetic.simulate(u)
     compiled = eqx.filter_jit(hj.linear.LDTP.simulate)(synthetic, u)
     assert_allclose(compiled, plain, atol=1e-14)
-    two_inputs = jax.vmap(synthetic.simulate)(np.stack([u, 2 * u]))
-    assert_allclose(two_inputs, np.stack([plain, 2 * plain]), atol=1e-13)
+    inputs = np.stack([u, 2 * u])
+    two_inputs = jax.vmap(synthetic.simulate)(inputs)
+    expected = np.stack([plain, 2 * plain])
+    assert_allclose(two_inputs, expected, atol=1e-13)
 
     # The second system of a batch has no feedthrough.
     batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), synthetic)
-    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, batch.D.at[1].set(0.0))
+    direct = batch.D.at[1].set(0.0)
+    batch = eqx.tree_at(lambda ldtp: ldtp.D, batch, direct)
     two_systems = eqx.filter_vmap(lambda ldtp: ldtp.simulate(u))(batch)
     assert_allclose(two_systems[0], plain, atol=1e-14)
     assert not np.allclose(two_systems[1], plain)
@@ -122,7 +132,9 @@ def test_systems_known_outside_of_jit_work_inside(synthetic):
         for printed in (ldtp, htf, s.htf([0.3])):
             repr(printed)
         x0 = s.periodic_state(u, 2)
-        return ldtp.simulate(u, x0[:3]), htf.error(s.htf(f, harmonics))
+        outputs = ldtp.simulate(u, x0[:3])
+        error = htf.error(s.htf(f, harmonics))
+        return outputs, error
 
     rng = np.random.default_rng(2)
     u = rng.normal(size=(12, 2))
@@ -161,12 +173,15 @@ def test_bad_definitions(change, message):
 
 def test_single_precision_is_refused():
     with pytest.raises(hj.errors.PrecisionError, match="A.*float32"):
-        hj.linear.LDTP(**(GOOD | {"A": jnp.zeros((2, 3, 3), jnp.float32)}))
+        single = jnp.zeros((2, 3, 3), jnp.float32)
+        hj.linear.LDTP(**(GOOD | {"A": single}))
 
 
 def test_a_response_without_bounds_is_refused():
     quarter_turn = [[[0.0, -1.0], [1.0, 0.0]]]
-    rotation = hj.linear.LDTP(quarter_turn, np.ones((1, 2, 1)), np.ones((1, 1, 2)))
+    B = np.ones((1, 2, 1))
+    C = np.ones((1, 1, 2))
+    rotation = hj.linear.LDTP(quarter_turn, B, C)
     rotation.periodic_state(np.ones((3, 1)), 3)
     with pytest.raises(
         hj.errors.DefinitionError, match="f = 0.25 cycles per period is unbounded"

@@ -17,9 +17,13 @@ RTOL = 1e-12
 
 def basis_at_random(rng, d):
     """A matrix with condition number at most 9."""
-    left, _ = np.linalg.qr(rng.normal(size=(d, d)))
-    right, _ = np.linalg.qr(rng.normal(size=(d, d)))
-    sizes = np.exp(rng.uniform(-np.log(3), np.log(3), d))
+    draws = rng.normal(size=(d, d))
+    left, _ = np.linalg.qr(draws)
+    others = rng.normal(size=(d, d))
+    right, _ = np.linalg.qr(others)
+    widest = np.log(3)
+    logarithms = rng.uniform(-widest, widest, d)
+    sizes = np.exp(logarithms)
     return left * sizes @ right
 
 
@@ -36,7 +40,9 @@ def chain(rng, multipliers, extra):
     factors = []
     for n in range(N):
         after = (n + 1) % N
-        core = rng.normal(size=(modes + extra[after], modes + extra[n])) / 2
+        rows = modes + extra[after]
+        columns = modes + extra[n]
+        core = rng.normal(size=(rows, columns)) / 2
         core[:, :modes] = 0
         k = 0
         for m in multipliers:
@@ -46,9 +52,11 @@ def chain(rng, multipliers, extra):
                 core[k : k + 2, k : k + 2] = [[z.real, -z.imag], [z.imag, z.real]]
                 k += 2
             else:
-                core[k, k] = np.sign(m) * size if n == 0 else size
+                signed = np.sign(m) * size
+                core[k, k] = signed if n == 0 else size
                 k += 1
-        factors.append(S[after] @ core @ np.linalg.inv(S[n]))
+        inverse = np.linalg.inv(S[n])
+        factors.append(S[after] @ core @ inverse)
     return factors
 
 
@@ -64,15 +72,21 @@ def largest_difference(found, true, relative):
 def relative_error(found, multipliers):
     true = []
     for m in multipliers:
-        true += [m, np.conj(m)] if np.iscomplex(m) else [m]
+        true.append(m)
+        if np.iscomplex(m):
+            true.append(np.conj(m))
     assert len(found) == len(true)
     return largest_difference(found, np.array(true), relative=True)
 
 
 def assert_conjugate_and_sorted(found):
-    assert np.all(np.diff(np.abs(found)) <= 1e-15 * np.abs(found[:-1]))
+    moduli = np.abs(found)
+    steps = np.diff(moduli)
+    rounding = 1e-15 * np.abs(found[:-1])
+    assert np.all(steps <= rounding)
     values = list(found)
-    assert all(np.conj(value) in values for value in values)
+    for value in values:
+        assert np.conj(value) in values
 
 
 @pytest.mark.parametrize(
@@ -91,7 +105,8 @@ def assert_conjugate_and_sorted(found):
 )
 def test_widely_spread_multipliers_keep_their_digits(multipliers, sections=32):
     rng = np.random.default_rng(sections)
-    found = product_eigenvalues(chain(rng, multipliers, np.zeros(sections, int)), RTOL)
+    factors = chain(rng, multipliers, np.zeros(sections, int))
+    found = product_eigenvalues(factors, RTOL)
     assert relative_error(found, multipliers) < 1e-11
     assert_conjugate_and_sorted(found)
 
@@ -107,7 +122,8 @@ def test_dimensions_that_vary_add_no_multipliers(multipliers):
     factors = chain(rng, multipliers, extra)
     found = product_eigenvalues(factors, RTOL)
     assert relative_error(found, multipliers) < 1e-10
-    assert product_rank(factors[5:] + factors[:5], RTOL) == len(found)
+    rotated = factors[5:] + factors[:5]
+    assert product_rank(rotated, RTOL) == len(found)
 
 
 @settings(max_examples=20)
@@ -121,8 +137,10 @@ def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
         product = factor @ product
     expected, vectors = np.linalg.eig(product)
     # Backward error of the product, magnified by the sensitivity of its eigenvalues.
-    size = np.prod([np.linalg.norm(factor, 2) for factor in factors])
-    bound = 1e-14 * d * sections * size * np.linalg.cond(vectors)
+    norms = [np.linalg.norm(factor, 2) for factor in factors]
+    size = np.prod(norms)
+    condition = np.linalg.cond(vectors)
+    bound = 1e-14 * d * sections * size * condition
     assert largest_difference(found, expected, relative=False) <= bound
     assert_conjugate_and_sorted(found)
 
@@ -130,7 +148,8 @@ def test_random_products_of_few_factors_agree_with_numpy(seed, d, sections):
 def test_structural_zeros_are_counted_not_guessed():
     nilpotent = np.diag([1.0, 1.0], 1)  # dies after three cycles
     assert len(product_eigenvalues([nilpotent], RTOL)) == 0
-    ranks = [product_rank([nilpotent] * cycles, RTOL) for cycles in (1, 2, 3)]
+    lengths = (1, 2, 3)
+    ranks = [product_rank([nilpotent] * cycles, RTOL) for cycles in lengths]
     assert ranks == [2, 1, 0]
 
     mixed = np.zeros((4, 4))
@@ -157,9 +176,11 @@ def test_products_that_leave_the_range_of_numbers():
 
 
 def test_defective_and_cyclic_products():
-    jordan = [np.array([[0.9, 0.3], [0.0, 0.9]])] * 8
+    block = np.array([[0.9, 0.3], [0.0, 0.9]])
+    jordan = [block] * 8
     assert_allclose(product_eigenvalues(jordan, RTOL), 0.9**8, rtol=1e-6)
-    roots = product_eigenvalues([np.roll(np.eye(6), 1, axis=0)], RTOL)
+    shift = np.roll(np.eye(6), 1, axis=0)
+    roots = product_eigenvalues([shift], RTOL)
     assert_allclose(roots**6, 1, atol=1e-13)
     assert_conjugate_and_sorted(roots)
     measured = product_eigenvalues([np.eye(3)] * 4, RTOL)
@@ -170,12 +191,15 @@ def test_hopper(hopper, reference):
     data = reference("ldtp_isochron")
     found = hopper.multipliers
     assert_allclose(found, data["eig_nonzero"][0], rtol=0, atol=1e-13)
-    assert [hopper.rank(n) for n in range(32)] == list(data["rank_monodromy"])
-    assert_allclose(hopper.monodromy(7), data["monodromy"][7], rtol=0, atol=1e-14)
+    ranks = [hopper.rank(n) for n in range(32)]
+    assert ranks == list(data["rank_monodromy"])
+    expected = data["monodromy"][7]
+    assert_allclose(hopper.monodromy(7), expected, rtol=0, atol=1e-14)
 
 
 def test_the_synthetic_system(synthetic):
-    assert list(synthetic.dims) == [3, 2, 3, 2, 3, 2]
+    dims = list(synthetic.dims)
+    assert dims == [3, 2, 3, 2, 3, 2]
     pair = 0.3270675 + 0.0596405918293070j
     assert_allclose(synthetic.multipliers, [pair, pair.conjugate()], rtol=1e-13)
 
@@ -194,7 +218,8 @@ def test_factors_that_are_not_finite():
         with pytest.raises(
             hj.errors.ComputationError, match="1\\] holds NaN or infinity"
         ):
-            function([np.eye(2), np.full((2, 2), np.nan)], RTOL)
+            unknown = np.full((2, 2), np.nan)
+            function([np.eye(2), unknown], RTOL)
 
 
 def test_multipliers_refuse_to_be_traced(synthetic):

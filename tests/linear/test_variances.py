@@ -14,26 +14,33 @@ F = np.arange(1, 20) / 20
 
 def an_htf(**more):
     rng = np.random.default_rng(0)
-    H = rng.normal(size=(3, len(F), 2, 1, 2)) @ [1, 1j]
+    parts = rng.normal(size=(3, len(F), 2, 1, 2))
+    H = parts @ [1, 1j]
     return hj.linear.HTF(F, H, (-1, 0, 1), 4, **more)
 
 
 @pytest.fixture(scope="module")
 def htf():
     rng = np.random.default_rng(1)
-    size = rng.uniform(1, 2, (3, len(F), 2, 1))
-    variance_dof = hj.linear.VarianceDof(np.full(len(F), 4.0), size)
+    shape = (3, len(F), 2, 1)
+    size = rng.uniform(1, 2, shape)
+    dof = np.full(len(F), 4.0)
+    variance_dof = hj.linear.VarianceDof(dof, size)
     return an_htf(variance=2 * size, noise_variance=size, variance_dof=variance_dof)
 
 
 def test_the_radius_is_that_of_the_f_distribution(htf):
-    expected = np.sqrt(stats.f.ppf(0.95, 2, 8) * np.asarray(htf.variance))
+    quantile = stats.f.ppf(0.95, 2, 8)
+    expected = np.sqrt(quantile * np.asarray(htf.variance))
     plain = an_htf(
         variance=htf.variance, variance_dof=hj.linear.VarianceDof(htf.variance_dof.dof)
     )
     assert_allclose(plain.confidence_radius(), expected, rtol=1e-12)
-    level = 1 - 0.05 * (1 + 0.95**2 * (np.asarray(htf.variance_dof.roundness) - 1))
-    expected = np.sqrt(stats.f.ppf(level, 2, 8) * np.asarray(htf.variance))
+    unevenness = np.asarray(htf.variance_dof.roundness) - 1
+    larger = 1 + 0.95**2 * unevenness
+    level = 1 - 0.05 * larger
+    quantile = stats.f.ppf(level, 2, 8)
+    expected = np.sqrt(quantile * np.asarray(htf.variance))
     for radius in (
         hj.linear.HTF.confidence_radius,
         jax.jit(hj.linear.HTF.confidence_radius),

@@ -22,7 +22,9 @@ def double_pendulum():
     """Two equal masses on two equal rods, by absolute angles from straight down."""
 
     def positions(q):
-        directions = jnp.stack([jnp.sin(q), -jnp.cos(q)], axis=1)
+        x = jnp.sin(q)
+        y = -jnp.cos(q)
+        directions = jnp.stack([x, y], axis=1)
         return L * jnp.cumsum(directions, axis=0)
 
     def kinetic(q, v):
@@ -40,7 +42,8 @@ def free_ball():
     """A ball in the plane; the term linear in v has no effect on its motion."""
 
     def kinetic(q, v):
-        return 0.5 * M * jnp.sum(v**2) + v[0]
+        square = jnp.sum(v**2)
+        return 0.5 * M * square + v[0]
 
     def potential(q):
         return M * G * q[1]
@@ -57,16 +60,21 @@ def test_a_double_pendulum_moves_as_textbooks_say():
     @jax.jit
     def motion(q, v, f):
         acceleration = pendulum.acceleration(q, v, f)
-        _, power = jax.jvp(pendulum.energy, (q, v), (v, acceleration))
+        tangents = (v, acceleration)
+        _, power = jax.jvp(pendulum.energy, (q, v), tangents)
         return pendulum.mass(q), pendulum.bias(q, v), acceleration, power
 
     mass, bias, acceleration, power = motion(q, v, f)
     s = jnp.sin(q[0] - q[1])
     c = jnp.cos(q[0] - q[1])
-    expected_mass = m * L**2 * jnp.array([[2, c], [c, 1]])
+    ratios = jnp.array([[2, c], [c, 1]])
+    expected_mass = m * L**2 * ratios
     assert_allclose(mass, expected_mass, rtol=1e-12)
-    centrifugal = m * L**2 * s * jnp.array([v[1] ** 2, -(v[0] ** 2)])
-    weight = m * G * L * jnp.array([2, 1]) * jnp.sin(q)
+    squares = jnp.array([v[1] ** 2, -(v[0] ** 2)])
+    centrifugal = m * L**2 * s * squares
+    masses = jnp.array([2, 1])
+    moments = m * G * L * masses
+    weight = moments * jnp.sin(q)
     assert_allclose(bias, centrifugal + weight, rtol=1e-12)
     expected = np.linalg.solve(expected_mass, f - centrifugal - weight)
     assert_allclose(acceleration, expected, rtol=1e-12)
@@ -79,13 +87,17 @@ def test_a_contact_that_holds_is_a_rod():
     rate = 1.2
 
     def position(angles):
-        return L * jnp.stack([jnp.sin(angles[0]), -jnp.cos(angles[0])])
+        x = jnp.sin(angles[0])
+        y = -jnp.cos(angles[0])
+        return L * jnp.stack([x, y])
 
     def rod(q):
         return jnp.sum(q**2) / 2
 
     pendulum = free_ball().along(position)
-    acceleration = jax.jit(pendulum.acceleration)(jnp.array([angle]), jnp.array([rate]))
+    q = jnp.array([angle])
+    v = jnp.array([rate])
+    acceleration = jax.jit(pendulum.acceleration)(q, v)
     assert_allclose(acceleration, [-G / L * np.sin(angle)], rtol=1e-13)
 
     @jax.jit
@@ -94,9 +106,11 @@ def test_a_contact_that_holds_is_a_rod():
 
     q, v = jax.jvp(position, (jnp.array([angle]),), (jnp.array([rate]),))
     found = held(q, v)
-    tension = M * (G * np.cos(angle) + L * rate**2)
+    gravity = G * np.cos(angle)
+    tension = M * (gravity + L * rate**2)
     assert_allclose(found.force * L, [-tension], rtol=1e-13)
-    tangent = jnp.array([np.cos(angle), np.sin(angle)])
+    direction = [np.cos(angle), np.sin(angle)]
+    tangent = jnp.array(direction)
     expected = L * acceleration[0]
     assert_allclose(found.acceleration @ tangent, expected, rtol=1e-12)
 
@@ -108,7 +122,8 @@ def test_impacts(restitution):
     pendulum = double_pendulum()
 
     def tip(q):
-        return [L * (jnp.sin(q[0]) + jnp.sin(q[1]))]
+        height = jnp.sin(q[0]) + jnp.sin(q[1])
+        return [L * height]
 
     @jax.jit
     def impact(restitution):
@@ -116,10 +131,12 @@ def test_impacts(restitution):
 
     after = impact(restitution)
     J = L * np.cos(q)[None]
-    assert_allclose(J @ after.velocity, -restitution * (J @ v), atol=1e-14)
+    rate_before = J @ v
+    assert_allclose(J @ after.velocity, -restitution * rate_before, atol=1e-14)
     momentum = pendulum.mass(q) @ (after.velocity - v)
     assert_allclose(momentum, J.T @ after.impulse, rtol=1e-12)
-    lost = pendulum.energy(q, v) - pendulum.energy(q, after.velocity)
+    after_impact = pendulum.energy(q, after.velocity)
+    lost = pendulum.energy(q, v) - after_impact
     if restitution == 1:
         assert abs(lost) < 1e-12
     else:
@@ -130,7 +147,9 @@ def worn(t, q, u):
     """The second body wears away as the first moves, until x = 1."""
 
     def lost(q, v):
-        return 0.5 * v[0] ** 2 + 0.5 * jnp.maximum(1 - q[0], 0.0) * v[1] ** 2
+        first = 0.5 * v[0] ** 2
+        mass = jnp.maximum(1 - q[0], 0.0)
+        return first + 0.5 * mass * v[1] ** 2
 
     return jnp.concatenate(
         [q[2:], hj.systems.Mechanism(lost).acceleration(q[:2], q[2:])]
@@ -138,7 +157,8 @@ def worn(t, q, u):
 
 
 def test_a_singular_mass_matrix_ends_the_trajectory_with_its_cause():
-    system = toy({"move": Field(("x", "y", "vx", "vy"), worn)})
+    chart = Field(("x", "y", "vx", "vy"), worn)
+    system = toy({"move": chart})
     found = hj.simulate(system, "move", (0.0, 0.0, 1.5, 0.0), 5.0, throw=False)
     assert found.result == hj.errors.Result.FIELD_NOT_FINITE
     assert_allclose(found.t[-1], 2 / 3, rtol=1e-6)

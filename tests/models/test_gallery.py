@@ -214,7 +214,8 @@ def test_cycle_and_multipliers(name):
 @pytest.mark.slow
 def test_where_no_section_is_met_again_one_is_asked_for():
     wheel = m.RimlessWheel()
-    after_impact = hj.Guess("swing", (float(wheel.slope - wheel.alpha), 0.45))
+    angle = float(wheel.slope - wheel.alpha)
+    after_impact = hj.Guess("swing", (angle, 0.45))
     with pytest.raises(
         hj.errors.ComputationError, match=r"section=AtEvent\('impact'\)"
     ):

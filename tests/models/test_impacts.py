@@ -25,7 +25,8 @@ LAND = [[-2.390006, -0.195003], [0.0, -2.5]]
 def test_the_cycle_and_its_multipliers(n):
     cycle = hj.find_limit_cycle(hj.models.BouncingChain(n=n))
     truth = TRUTH[str(n)]
-    assert_allclose(list(cycle.state.values()), truth["state"], atol=1e-12)
+    state = list(cycle.state.values())
+    assert_allclose(state, truth["state"], atol=1e-12)
     multipliers = np.array(truth["multipliers"]) @ [1, 1j]
     differences = np.abs(multipliers[:, None] - cycle.multipliers)
     assert differences.min(axis=0).max() < 1e-12, "each that was found is a true one"
@@ -34,7 +35,8 @@ def test_the_cycle_and_its_multipliers(n):
     events = cycle.trajectory().events
     times, masses = zip(*truth["impacts"], strict=True)
     assert_allclose([event.time for event in events], times)
-    assert [event.name for event in events] == [f"impact {i}" for i in masses]
+    names = [event.name for event in events]
+    assert names == [f"impact {i}" for i in masses]
 
 
 def test_events_that_coincide_neither_graze_nor_accumulate():
@@ -43,7 +45,8 @@ def test_events_that_coincide_neither_graze_nor_accumulate():
     pace = np.array([[0.0], [np.inf], [0.0], [0.0]])
     event = np.ones(1, bool)
     for moved in [1.0, 0.0] * 9:
-        pace, zeno = keep_pace(pace, np.array([moved]), event, ~event, 2.0, 2)
+        times = np.array([moved])
+        pace, zeno = keep_pace(pace, times, event, ~event, 2.0, 2)
         assert not zeno
 
 
@@ -60,5 +63,6 @@ def test_each_order_of_the_feet_has_its_derivative():
         for order, derivative in zip(both.orders, both.derivatives, strict=True):
             sign = 1 if order[0].startswith("hind") else -1
             expected = np.eye(4)
-            expected[1::2, ::2] = size * np.array([[1, sign], [1, 1]])
+            signs = np.array([[1, sign], [1, 1]])
+            expected[1::2, ::2] = size * signs
             assert_allclose(derivative, expected, atol=1e-6)

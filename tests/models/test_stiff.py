@@ -50,7 +50,10 @@ def test_relaxation_oscillations(name):
     cycle = hj.find_limit_cycle(make(), section=section)
     assert float(cycle.period) == pytest.approx(period, rel=1e-9)
     t, x = cycle.trajectory()(next(iter(cycle.state)))
-    at_top = cycle.state["x"] if "x" in cycle.state else _top(cycle, t[np.argmax(x)])
+    if "x" in cycle.state:
+        at_top = cycle.state["x"]
+    else:
+        at_top = _top(cycle, t[np.argmax(x)])
     assert at_top == pytest.approx(top, rel=1e-9)
     assert cycle.log_multipliers == pytest.approx([logarithm], rel=1e-6)
     assert cycle.stable
@@ -60,10 +63,12 @@ def _top(cycle, near):
     """The largest v, where w is on the nullcline of v: the cycle's next crossing of that."""
 
     def level(t, q):
-        return q[0] - q[0] ** 3 / 3 - q[1] + 0.5
+        cubic = q[0] - q[0] ** 3 / 3
+        return cubic - q[1] + 0.5
 
     falls = hj.sections.SectionList([hj.Crossing(level, "falling")])
-    return float(hj.sections.place_sections(cycle, falls).lanes.q[0, 0])
+    placed = hj.sections.place_sections(cycle, falls)
+    return float(placed.lanes.q[0, 0])
 
 
 def test_the_hopper_on_a_compliant_ground():
@@ -75,11 +80,16 @@ def test_the_hopper_on_a_compliant_ground():
         -7.3255629625297901e-5,
         0.0016616904927162742,
     ]
-    found = np.array(list(cycle.state.values())) / list(cycle.scale.values())
-    expected = state / np.array(list(cycle.scale.values()))
+    states = np.array(list(cycle.state.values()))
+    scales = list(cycle.scale.values())
+    found = states / scales
+    scale = np.array(list(cycle.scale.values()))
+    expected = state / scale
     assert_allclose(found, expected, atol=1e-11)
     z = -0.24885118328047069434 + 0.69922500780850327787j
-    assert_allclose(cycle.multipliers[:2], [z, z.conjugate()], atol=1e-12)
+    pair = [z, z.conjugate()]
+    assert_allclose(cycle.multipliers[:2], pair, atol=1e-12)
     assert cycle.multipliers[2] == pytest.approx(1.6159409134125691e-4, abs=1e-14)
     model = hj.linearize(cycle, hj.ClockPhase(16))
-    assert_allclose(model.multipliers[:2], [z, z.conjugate()], atol=1e-10)
+    pair_of_model = [z, z.conjugate()]
+    assert_allclose(model.multipliers[:2], pair_of_model, atol=1e-10)

@@ -52,17 +52,20 @@ def test_A_and_B(name):
 
     d = len(state)
     leg = np.zeros(d)
-    leg[: len(WALKERS[name][0])] = WALKERS[name][0]
+    values = WALKERS[name][0]
+    leg[: len(values)] = values
     for n in range(4):
         out_before = int(sections.drop[n]) - 1
-        out_after = int(sections.drop[(n + 1) % 4]) - 1
+        dropped = int(sections.drop[(n + 1) % 4])
+        out_after = dropped - 1
         rows = np.flatnonzero(np.arange(d) != out_after)
         columns = np.flatnonzero(np.arange(d) != out_before)
         moved = by_state[n] @ along_section(out_before, leg)
         A = moved[np.ix_(rows, columns)]
         B = by_input[n][rows]
         tolerance = 1e-8 * np.max(np.abs(A))
-        found = model.A[n][: len(rows), : len(columns)]
+        whole = model.A[n]
+        found = whole[: len(rows), : len(columns)]
         assert_allclose(found, A, rtol=0, atol=tolerance, err_msg=f"A[{n}]")
         tolerance = 1e-8 * np.max(np.abs(B))
         found = model.B[n][: len(rows), 0]

@@ -14,20 +14,27 @@ NAMES = ("t", "yM", "vM", "ym", "vm")
 
 
 def _leg(t, yM, ym):
-    return 10.0 * (2.0 - (yM - ym)) + 20.0 * np.sin(2 * np.pi * t)
+    spring = 10.0 * (2.0 - (yM - ym))
+    motor = 20.0 * np.sin(2 * np.pi * t)
+    return spring + motor
 
 
 def _field(t, q, u):
     yM, vM = q[:2]
     if len(q) == 2:
-        return np.array([vM, (_leg(t, yM, 0.0) + u) / 2.0 - 2.0])
+        force = _leg(t, yM, 0.0) + u
+        acceleration = force / 2.0 - 2.0
+        return np.array([vM, acceleration])
     ym, vm = q[2:]
     leg = _leg(t, yM, ym)
-    return np.array([vM, (leg + u) / 2.0 - 2.0, vm, -leg - 5.0 * vm - 2.0])
+    body = (leg + u) / 2.0 - 2.0
+    foot = -leg - 5.0 * vm - 2.0
+    return np.array([vM, body, vm, foot])
 
 
 def plane(point):
-    return (point[1] - 1.9) / 0.3, point[2] / 1.9
+    x = (point[1] - 1.9) / 0.3
+    return x, point[2] / 1.9
 
 
 def _level(section, t, q):
@@ -36,11 +43,14 @@ def _level(section, t, q):
     if kind == "clock":
         return value - t
     x, y = plane((t, *q))
-    return y * np.cos(value) - x * np.sin(value)
+    along = y * np.cos(value)
+    return along - x * np.sin(value)
 
 
 def _guard(t, q):
-    return _leg(t, q[0], 0.0) + 2.0 if len(q) == 2 else q[2]
+    if len(q) == 2:
+        return _leg(t, q[0], 0.0) + 2.0
+    return q[2]
 
 
 def _polish(function, t, q, u):
@@ -48,7 +58,9 @@ def _polish(function, t, q, u):
     for _ in range(2):
         e = 1e-6
         f = _field(t, q, u)
-        rate = (function(t + e, q + e * f) - function(t - e, q - e * f)) / (2 * e)
+        later = function(t + e, q + e * f)
+        earlier = function(t - e, q - e * f)
+        rate = (later - earlier) / (2 * e)
         dt = -function(t, q) / rate
         t = t + dt
         q = q + dt * f
@@ -89,13 +101,16 @@ def flow(point, section, u=0.0, retention=1.0):
         before = path.t[-2]
         end = path.t[-1]
         if end > before:
-            last = solve(before, path.y[:, -2], u, end)
+            begin = path.y[:, -2]
+            last = solve(before, begin, u, end)
             watched = level if at_section else guard
-            t, q = _polish(watched, end, last.y[:, -1], u)
+            start = last.y[:, -1]
+            t, q = _polish(watched, end, start, u)
         if at_section:
             return np.array([t, *q])
         if len(q) == 4:  # touchdown
-            q = np.array([q[0], retention * q[1]])
+            speed = retention * q[1]
+            q = np.array([q[0], speed])
         else:  # liftoff
             q = np.array([q[0], q[1], 0.0, 0.0])
 
@@ -107,10 +122,14 @@ def onto(section, point, names):
     if kind == "clock":
         point[0] = value
     elif "vM" not in names:
-        point[2] = 1.9 * np.tan(value) * (point[1] - 1.9) / 0.3
+        height = point[1] - 1.9
+        slope = 1.9 * np.tan(value)
+        point[2] = slope * height / 0.3
     else:
         assert "yM" not in names
-        point[1] = 1.9 + 0.3 * (point[2] / 1.9) / np.tan(value)
+        ratio = point[2] / 1.9
+        shift = 0.3 * ratio / np.tan(value)
+        point[1] = 1.9 + shift
     return point
 
 
@@ -130,7 +149,8 @@ def jacobian(point, here, there, names, names_after, retention=1.0, e=2e-4):
 
     def derivative(value):
         once = value(e) - value(-e)
-        twice = value(2 * e) - value(-2 * e)
+        ahead = value(2 * e)
+        twice = ahead - value(-2 * e)
         return (8 * once - twice) / (12 * e)
 
     columns = []

@@ -14,7 +14,9 @@ class Swing(hj.Chart):
 
     def field(self, t, q, u):
         x, v = q
-        return v, -0.05 * v - (0.25 + 0.2 * jnp.cos(t)) * x - x**3
+        stiffness = 0.25 + 0.2 * jnp.cos(t)
+        force = stiffness * x
+        return v, -0.05 * v - force - x**3
 
 
 class Pumped(hj.HybridSystem):
@@ -34,10 +36,14 @@ def test_a_search_for_two_periods_leaves_the_rest_to_which_newtons_method_leads(
 
     def rates(t, q):
         x, v = q
-        return v, -0.05 * v - (0.25 + 0.2 * np.cos(t)) * x - x**3
+        stiffness = 0.25 + 0.2 * np.cos(t)
+        force = stiffness * x
+        return v, -0.05 * v - force - x**3
 
     end = solve_ivp(rates, (0, 400 * np.pi), (0.15, 0.05), rtol=1e-9, atol=1e-12)
-    assert_allclose(np.abs(cycle.anchor.q[:, 0]), np.abs(end.y[:, -1]), rtol=1e-6)
+    found = np.abs(cycle.anchor.q[:, 0])
+    expected = np.abs(end.y[:, -1])
+    assert_allclose(found, expected, rtol=1e-6)
 
 
 class Held(hj.Chart):
@@ -84,7 +90,10 @@ class Membrane(hj.Chart):
 
     def field(self, t, q, u):
         v, w = q
-        return 0.04 * v**2 + 5 * v + 150 - w, 0.02 * (0.2 * v - w)
+        own = 0.04 * v**2 + 5 * v
+        rise = own + 150 - w
+        recovery = 0.02 * (0.2 * v - w)
+        return rise, recovery
 
 
 class Chattering(hj.HybridSystem):
@@ -105,16 +114,19 @@ class Chattering(hj.HybridSystem):
 
 @pytest.mark.slow
 def test_a_burst_that_meets_the_plane_through_its_guess_twice_is_found():
-    cycle = hj.find_limit_cycle(Chattering(), hj.Guess("membrane", (-55.0, 0.0)))
+    guess = hj.Guess("membrane", (-55.0, 0.0))
+    cycle = hj.find_limit_cycle(Chattering(), guess)
     path = hj.simulate(Chattering(), "membrane", (-55.0, 0.0), 600.0)
     spikes = np.array([event.time for event in path.events])
     assert len(cycle.event_sequence) == 5
-    assert_allclose(cycle.period, spikes[-1] - spikes[-6], rtol=1e-7)
+    five_bursts = spikes[-1] - spikes[-6]
+    assert_allclose(cycle.period, five_bursts, rtol=1e-7)
 
 
 @pytest.mark.slow
 def test_a_search_waits_for_a_slow_manifold_to_end():
     """The fast mode of x = 6 decays 36 times as fast as x moves."""
     system = hj.models.VanDerPol(mu=6.0)
-    far = hj.find_limit_cycle(system, hj.Guess("oscillation", (6.0, 0.3)))
+    guess = hj.Guess("oscillation", (6.0, 0.3))
+    far = hj.find_limit_cycle(system, guess)
     assert_allclose(far.period, hj.find_limit_cycle(system).period, rtol=1e-10)

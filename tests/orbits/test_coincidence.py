@@ -70,7 +70,8 @@ def ticked(height=1.0, other=0.0):
         )
 
     def rates(t, q, u):
-        return (1.0 - 0.1 * q[0] + 0.0 * jnp.sin(t),)
+        no_wave = 0.0 * jnp.sin(t)
+        return (1.0 - 0.1 * q[0] + no_wave,)
 
     charts = {"a": Field(("x",), rates)}
     return toy(charts, transitions, period=1.0)
@@ -92,7 +93,9 @@ def race():
     x, y = (lambda t, q, u, k=k: q[k] - 1.0 for k in range(2))
 
     def again(t, q, u):
-        return (0.5 + 0.1 * (q[0] + 1.0), 0.5 + 0.1 * (q[1] + 1.5))
+        x = 0.5 + 0.1 * (q[0] + 1.0)
+        y = 0.5 + 0.1 * (q[1] + 1.5)
+        return (x, y)
 
     transitions = (
         hj.Transition("x", "a", "x first", x, "rising"),
@@ -106,14 +109,20 @@ def race():
 
 def test_derivatives_of_both_orders():
     """By hand: x is at 1 at the time -dx, or -(dx + 2 dy) / 3 if y was there first; and so on."""
-    cycle = hj.find_limit_cycle(race(), hj.Guess("a", (0.6, 0.6), 0.1), throw=False)
+    guess = hj.Guess("a", (0.6, 0.6), 0.1)
+    cycle = hj.find_limit_cycle(race(), guess, throw=False)
     assert cycle.result == hj.errors.Result.SIMULTANEOUS
     (found,) = cycle.simultaneous_events()
     assert found.time % 1.0 == pytest.approx(0.5)
     assert not found.commute
     exact = {
         ("x", "y second"): np.array([[-1.5, -2.5], [-2.5, -2.5]]),
-        ("y", "x second"): np.array([[-4 / 3, -8 / 3], [-2.0, -3.0]]),
+        ("y", "x second"): np.array(
+            [
+                [-4 / 3, -8 / 3],
+                [-2.0, -3.0],
+            ]
+        ),
     }
     assert set(found.orders) == set(exact)
     for order, derivative in zip(found.orders, found.derivatives, strict=True):
@@ -124,13 +133,15 @@ def test_an_event_that_coincides_with_the_one_at_the_anchor():
     with pytest.raises(
         hj.errors.ComputationError, match="'y' coincides with 'x', its beginning"
     ):
-        hj.find_limit_cycle(PAIR, hj.Guess("a", (0.1, 0.1)), section=hj.AtEvent("x"))
+        guess = hj.Guess("a", (0.1, 0.1))
+        hj.find_limit_cycle(PAIR, guess, section=hj.AtEvent("x"))
 
 
 @pytest.mark.slow
 def test_cycles_of_a_sweep_and_of_a_branch_on_which_events_coincide():
     """Clocks of their own, whose events commute, and such that do not."""
-    systems = eqx.filter_vmap(lambda c: Balls(coupling=c))(jnp.array([0.0, 0.2, 0.4]))
+    couplings = jnp.array([0.0, 0.2, 0.4])
+    systems = eqx.filter_vmap(lambda c: Balls(coupling=c))(couplings)
     begin = hj.find_limit_cycle(Balls(), BALLS)
     found = hj.orbits.find_limit_cycles(systems, begin)
     ok = hj.errors.Result.OK
@@ -148,7 +159,8 @@ def test_an_event_that_coincides_with_a_schedule():
     with pytest.raises(
         hj.errors.ComputationError, match="'full' and 'tick' coincide|'tick' and 'full'"
     ):
-        hj.find_limit_cycle(ticked(height), hj.Guess("a", (0.5,), 0.3))
+        guess = hj.Guess("a", (0.5,), 0.3)
+        hj.find_limit_cycle(ticked(height), guess)
 
 
 class Filled(hj.HybridSystem):
@@ -225,7 +237,8 @@ def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
     """x would be full 1e-10 before the tick: beside the cycle, the clock may empty it instead."""
     guess = hj.Guess("up", (0.4,), time=0.5)
     found = results_of_all_searches(Filled, guess, 0.9 - 1e-10)
-    assert found == dict.fromkeys(found, int(hj.errors.Result.SIMULTANEOUS))
+    together = int(hj.errors.Result.SIMULTANEOUS)
+    assert found == dict.fromkeys(found, together)
     early = hj.find_limit_cycle(Filled(0.9 - 1e-7), guess)
     assert early.event_sequence == (0, 2)
 
@@ -233,11 +246,13 @@ def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
 def test_clocks_that_tick_together_are_accepted_by_all_searches():
     guess = hj.Guess("a", (1.0,), time=0.9)
     found = results_of_all_searches(Clocks, guess, 0.9)
-    assert found == dict.fromkeys(found, int(hj.errors.Result.OK))
+    ok = int(hj.errors.Result.OK)
+    assert found == dict.fromkeys(found, ok)
 
 
 def test_two_schedules_for_one_time():
     with pytest.raises(
         hj.errors.DefinitionError, match="'tick' and 'tock' are scheduled for the same"
     ):
-        hj.find_limit_cycle(ticked(other=0.5), hj.Guess("a", (0.5,), 0.3))
+        guess = hj.Guess("a", (0.5,), 0.3)
+        hj.find_limit_cycle(ticked(other=0.5), guess)

@@ -41,8 +41,11 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     impact_speed = g * float(juggler.T) / 2
     paddle_speed = (1 - a) * impact_speed / (1 + a)
     fold = paddle_speed / (2 * np.pi)  # the paddle just reaches the speed: s = 0
-    s = 2 * (1 + a**2) / (1 + a) ** 2 * g
-    flip = np.hypot(paddle_speed / (2 * np.pi), s / (2 * np.pi) ** 2)
+    square = (1 + a) ** 2
+    factor = 2 * (1 + a**2) / square
+    s = factor * g
+    weight = s / (2 * np.pi) ** 2
+    flip = np.hypot(paddle_speed / (2 * np.pi), weight)
 
     branch = by_amplitude
     at_fold, at_flip = branch.points
@@ -51,7 +54,8 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     assert_allclose(at_fold.value, fold, rtol=1e-11)
     assert_allclose(at_flip.value, flip, rtol=1e-11)
     assert_allclose(at_fold.multipliers, [1, a**2], atol=2e-6)
-    assert_allclose(at_flip.multipliers, [-1, -(a**2)], rtol=1e-9)
+    expected = [-1, -(a**2)]
+    assert_allclose(at_flip.multipliers, expected, rtol=1e-9)
     for end in branch.ends:
         assert end.message == "end of the parameter range"
 
@@ -61,8 +65,10 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     for k in at:
         cycle = branch[k]
         (impact,) = cycle.trajectory().events
-        acceleration = -((2 * np.pi) ** 2) * impact.before["y"]
-        trace = 1 + a**2 + (1 + a) ** 2 * acceleration / g
+        rate = 2 * np.pi
+        acceleration = -(rate**2) * impact.before["y"]
+        by_table = (1 + a) ** 2 * acceleration / g
+        trace = 1 + a**2 + by_table
         assert_allclose(np.sum(cycle.multipliers).real, trace, rtol=1e-9)
         again = hj.find_limit_cycle(cycle.system, cycle)
         assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
@@ -94,8 +100,10 @@ def test_a_branch_is_drawn_in_pieces_of_one_stability(by_amplitude):
     assert styles == ["--", "-", "--"], "unstable, stable, unstable"
     fold, flip = (point.index for point in branch.points)
     drawn = [line.get_xdata() for line in lines]
-    assert_array_equal(drawn[0], branch.values[: fold + 1])
-    assert_array_equal(drawn[1], branch.values[fold : flip + 1])
+    before_fold = branch.values[: fold + 1]
+    assert_array_equal(drawn[0], before_fold)
+    between = branch.values[fold : flip + 1]
+    assert_array_equal(drawn[1], between)
     assert_array_equal(drawn[2], branch.values[flip:])
 
 
@@ -128,9 +136,12 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
         g = float(end.system.g)
         T = float(end.system.T)
         (bounce,) = end.trajectory().events
-        assert_allclose(bounce.after["v"], g * T / 2, rtol=1e-9)
-        acceleration = -((2 * np.pi / T) ** 2) * bounce.before["y"]
-        trace = 1 + a**2 + (1 + a) ** 2 * acceleration / g
+        speed = g * T / 2
+        assert_allclose(bounce.after["v"], speed, rtol=1e-9)
+        stiffness = (2 * np.pi / T) ** 2
+        acceleration = -stiffness * bounce.before["y"]
+        by_table = (1 + a) ** 2 * acceleration / g
+        trace = 1 + a**2 + by_table
         assert_allclose(np.sum(end.multipliers), trace, atol=1e-7)
         assert_allclose(np.prod(end.multipliers), a**2, rtol=1e-9)
 
@@ -143,7 +154,8 @@ def test_derivatives_of_a_turn_by_a_clock_are_differences(system, parameter):
     cycle = hj.find_limit_cycle(system())
     curve = Curve(cycle, parameter, 1.0)
     point = np.append(curve.map.anchor.q, curve.value)
-    derivative = curve.turn(curve.map, point).jacobian[:, -1]
+    turn = curve.turn(curve.map, point)
+    derivative = turn.jacobian[:, -1]
 
     h = 1e-5 * curve.value
     step = np.zeros(len(point))
@@ -164,7 +176,8 @@ def test_bad_input(juggling):
         with pytest.raises(hj.errors.DefinitionError, match=words):
             follow(juggling, "A", values)
     with pytest.raises(hj.errors.DefinitionError, match="outside of jit"):
-        eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)(juggling)
+        program = eqx.filter_jit(lambda c: follow(c, "A", (0.1, 0.2)).values)
+        program(juggling)
     with pytest.raises(hj.errors.DefinitionError, match="has multiplicity 1, not 2"):
         hj.find_limit_cycle(juggling.system, juggling, multiplicity=2)
 
@@ -200,13 +213,16 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     branch = hj.continuation(hopper_cycle, "a", (1.0, 30.0))
     assert branch.ends[0].result == hj.errors.Result.GRAZING
     r = 2 * (2 * np.pi) ** 2
-    assert_allclose(branch.ends[0].value, 6 * (r - 10) / r, rtol=2e-6)
+    expected = 6 * (r - 10) / r
+    assert_allclose(branch.ends[0].value, expected, rtol=2e-6)
     # More, and liftoff comes before the phase at which the cycle given begins.
     assert branch.ends[1].message == "end of the parameter range"
     assert not branch.points
     assert branch.values[-1] == 30.0
-    assert float(branch[-1].anchor.t[0]) != 0.5
-    again = hj.find_limit_cycle(branch[-1].system, branch[-1])
+    time = float(branch[-1].anchor.t[0])
+    assert time != 0.5
+    last = branch[-1]
+    again = hj.find_limit_cycle(last.system, last)
     assert_allclose(again.multipliers, branch[-1].multipliers, rtol=1e-10)
 
 
@@ -221,14 +237,18 @@ class Maps(hj.HybridSystem):
 
     def charts(self):
         def rates(t, q, u):
-            return 0.0 * jnp.sin(2 * jnp.pi * t) * q
+            wave = jnp.sin(2 * jnp.pi * t)
+            return 0.0 * wave * q
 
         return {"a": Field(tuple("abcdef"), rates)}
 
     def transitions(self):
         def step(t, q, u):
-            r = self.growth.r + jnp.array([0.0, 0.0, 0.0, 0.01])
-            return *(r * q[:4] * (1 - q[jnp.array([0, 1, 4, 5])])), q[2], q[3]
+            change = jnp.array([0.0, 0.0, 0.0, 0.01])
+            r = self.growth.r + change
+            others = q[jnp.array([0, 1, 4, 5])]
+            growth = r * q[:4] * (1 - others)
+            return *growth, q[2], q[3]
 
         return [
             hj.Transition("step", "a", "a", hj.systems.Scheduled(1.0, 0.5), reset=step)
@@ -278,7 +298,9 @@ class IntegrateAndFire(hj.HybridSystem):
 
     def charts(self):
         def leak(t, q, u):
-            return 1.5 - q + self.a * jnp.sin(2 * jnp.pi * t / self.T)
+            phase = 2 * jnp.pi * t / self.T
+            wave = jnp.sin(phase)
+            return 1.5 - q + self.a * wave
 
         return {"leak": Field(("v",), leak)}
 
@@ -307,8 +329,10 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
     cycle = hj.find_limit_cycle(IntegrateAndFire())
     branch = hj.continuation(cycle, "a", (0.3, 0.8), step=0.1)
     (fold,) = branch.points
-    mean = 1 / (1 - np.exp(-period)) - 1.5
-    assert_allclose(fold.value, abs(mean) * np.hypot(1, rate), rtol=1e-9)
+    charge = 1 / (1 - np.exp(-period))
+    mean = charge - 1.5
+    expected = abs(mean) * np.hypot(1, rate)
+    assert_allclose(fold.value, expected, rtol=1e-9)
 
     begin, end = branch.ends
     assert end.message == "end of the parameter range"
@@ -317,15 +341,19 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
 
     # The potential between two spikes of the last cycle, in closed form.
     def steady(t):
-        wave = np.sin(rate * t) - rate * np.cos(rate * t)
+        sine = np.sin(rate * t)
+        wave = sine - rate * np.cos(rate * t)
         return 1.5 + begin.value * wave / (1 + rate**2)
 
     (spike,) = branch[0].trajectory().events
     start = float(spike.time) - period
     t = start + np.linspace(1e-9, period - 1e-9, 20001)
-    v = steady(t) - steady(start) * np.exp(-(t - start))
+    decay = np.exp(-(t - start))
+    v = steady(t) - steady(start) * decay
     middle = v[1:-1]
-    peaks = middle[(middle > v[:-2]) & (middle > v[2:])]
+    above_last = middle > v[:-2]
+    above_next = middle > v[2:]
+    peaks = middle[above_last & above_next]
     assert_allclose(peaks, 1.0, atol=1e-4)
 
 
@@ -339,7 +367,10 @@ class Boost(hj.HybridSystem):
             return -q[0] / (self.R * 1e-4), 1e5
 
         def off(t, q, u):
-            return (q[1] - q[0] / self.R) / 1e-4, (10.0 - q[0]) / 1e-4
+            load = q[0] / self.R
+            current = (q[1] - load) / 1e-4
+            voltage = (10.0 - q[0]) / 1e-4
+            return current, voltage
 
         def idle(t, q, u):
             return (-q[0] / (self.R * 1e-4),)
@@ -378,10 +409,26 @@ class Boost(hj.HybridSystem):
 def _least_current(R):
     """Of the cycle in continuous conduction, by exponentials of matrices beside a constant 1."""
     load = 1 / (R * 1e-4)
-    on = np.array([[-load, 0, 0], [0, 0, 1e5], [0, 0, 0]])
-    off = np.array([[-load, 1e4, 0], [-1e4, 0, 1e5], [0, 0, 0]])
-    turn = expm(off * 10e-6) @ expm(on * 10e-6)
-    return np.linalg.solve(np.eye(2) - turn[:2, :2], turn[:2, 2])[1]
+    on = np.array(
+        [
+            [-load, 0, 0],
+            [0, 0, 1e5],
+            [0, 0, 0],
+        ]
+    )
+    off = np.array(
+        [
+            [-load, 1e4, 0],
+            [-1e4, 0, 1e5],
+            [0, 0, 0],
+        ]
+    )
+    turn_on = expm(on * 10e-6)
+    turn = expm(off * 10e-6) @ turn_on
+    unit = np.eye(2)
+    back = unit - turn[:2, :2]
+    forcing = turn[:2, 2]
+    return np.linalg.solve(back, forcing)[1]
 
 
 @pytest.mark.slow
@@ -408,7 +455,10 @@ class Brusselator(hj.HybridSystem):
     def charts(self):
         def rates(t, q, u):
             x, y = q
-            return 1 - (self.b + 1) * x + x**2 * y, self.b * x - x**2 * y
+            square = x**2 * y
+            first = 1 - (self.b + 1) * x + square
+            second = self.b * x - square
+            return first, second
 
         return {"all": Field(("x", "y"), rates)}
 

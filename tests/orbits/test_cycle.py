@@ -28,7 +28,9 @@ def vanderpol(mu, guess=None, section=FALL, **options):
 
 def test_the_hopper_and_its_events(reference, hopper_cycle):
     data = reference("limit_cycle")
-    assert_allclose(hopper_cycle.anchor.q[:2, 0], data["state_clock_half"], atol=1e-10)
+    half = data["state_clock_half"]
+    state = hopper_cycle.anchor.q[:2, 0]
+    assert_allclose(state, half, atol=1e-10)
     assert hopper_cycle.result == hj.errors.Result.OK
     assert hopper_cycle.stable
     assert hopper_cycle.period == 1.0
@@ -45,7 +47,8 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
     (before, _), (after, _) = map(
         last_turn, (hopper_cycle, begin_later(hopper_cycle, 2))
     )
-    assert_array_equal(after.t, np.append(before.t[2:], before.t[:2] + 1.0))
+    later = before.t[:2] + 1.0
+    assert_array_equal(after.t, np.append(before.t[2:], later))
     text = repr(hopper_cycle)
     assert "liftoff, touchdown" in text
     assert "-0.248983335+0.699333252j" in text
@@ -62,7 +65,8 @@ def test_a_cycle_can_be_donated(hopper_cycle):
 
 def test_the_lossy_hopper(lossy_cycle):
     state = [1.87978886663710, 1.75832736962547]
-    assert_allclose(lossy_cycle.anchor.q[:2, 0], state, atol=1e-10)
+    found = lossy_cycle.anchor.q[:2, 0]
+    assert_allclose(found, state, atol=1e-10)
     multiplier = -0.317897006349938 + 0.694628822735891j
     assert_allclose(lossy_cycle.multipliers[0], multiplier, atol=1e-9)
     events = [e.time % 1 for e in lossy_cycle.trajectory().events]
@@ -94,7 +98,8 @@ def test_the_two_legged_bar():
         -0.0243713338437363,
         -0.268770117871700,
     ]
-    assert_allclose(list(events[3].after.values()), landed, atol=1e-9)
+    after = list(events[3].after.values())
+    assert_allclose(after, landed, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -103,10 +108,13 @@ def test_the_two_legged_bar():
 def test_van_der_pol(mu):
     """In reversed time, mu -> -mu, the cycle is the same and its multiplier the reciprocal."""
     amplitude, period, multiplier = VANDERPOL[abs(mu)]
-    cycle = vanderpol(mu, (2.0, 0.0) if mu < 0 else None)
-    assert_allclose(cycle.anchor.q[:, 0], [amplitude, 0.0], atol=1e-9)
+    start = (2.0, 0.0) if mu < 0 else None
+    cycle = vanderpol(mu, start)
+    at_rest = [amplitude, 0.0]
+    assert_allclose(cycle.anchor.q[:, 0], at_rest, atol=1e-9)
     assert_allclose(cycle.period, period, atol=1e-9)
-    assert_allclose(cycle.multipliers, [multiplier ** np.sign(mu)], rtol=1e-7, atol=0)
+    expected = [multiplier ** np.sign(mu)]
+    assert_allclose(cycle.multipliers, expected, rtol=1e-7, atol=0)
     assert not cycle.clocked
     assert cycle.event_sequence == ()
     assert cycle.stable == (mu > 0)
@@ -129,8 +137,10 @@ def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
     event = hj.Transition("spike", "a", "a", spike, "rising", again)
     guess = hj.Guess("a", (9e4,))
     section = hj.AtEvent("spike")
-    cycle = hj.find_limit_cycle(toy({"a": square}, [event]), guess, section=section)
-    assert_allclose(cycle.period, np.arctan(1e5) + np.pi / 4, rtol=1e-9)
+    system = toy({"a": square}, [event])
+    cycle = hj.find_limit_cycle(system, guess, section=section)
+    expected = np.arctan(1e5) + np.pi / 4
+    assert_allclose(cycle.period, expected, rtol=1e-9)
 
 
 def test_a_default_section_that_is_missed_is_replaced():
@@ -200,7 +210,9 @@ def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
     system = toy({"cells": cells}, spikes)
     guess = hj.Guess("cells", (0, 0.5))
     cycle = hj.find_limit_cycle(system, guess)
-    half = np.log(2 * 1.3 / (np.sqrt(0.1**2 + 4 * 1.3 * 0.3) - 0.1))
+    product = 4 * 1.3 * 0.3
+    root = np.sqrt(0.1**2 + product)
+    half = np.log(2 * 1.3 / (root - 0.1))
     assert_allclose(cycle.period, 2 * half, rtol=1e-10)
 
 
@@ -215,7 +227,8 @@ def test_a_flow_that_comes_to_rest_is_no_cycle():
 
     top = hj.Transition("top", "a", "a", top_guard, "rising")
     with pytest.raises(hj.errors.ComputationError, match="beyond the guard of 'top'"):
-        hj.find_limit_cycle(toy({"a": charging}, [top]), hj.Guess("a", (1.5,)))
+        system = toy({"a": charging}, [top])
+        hj.find_limit_cycle(system, hj.Guess("a", (1.5,)))
     with pytest.raises(
         hj.errors.ComputationError, match="leads to an equilibrium of chart"
     ):
@@ -228,7 +241,8 @@ def test_a_flow_that_comes_to_rest_is_no_cycle():
     drift = Field(("v",), drift_rates)
     missed = "was not crossed within .* start lies beyond the guard of 'top'"
     with pytest.raises(hj.errors.ComputationError, match=missed):
-        hj.find_limit_cycle(toy({"a": drift}, [top]), hj.Guess("a", (1.5,)))
+        system = toy({"a": drift}, [top])
+        hj.find_limit_cycle(system, hj.Guess("a", (1.5,)))
     far = hj.Crossing("x", "falling", value=10.0)
     with pytest.raises(hj.errors.ComputationError, match="Allow more time than 1, by"):
         vanderpol(1000.0, (2.0, 0.0), section=far, max_period=1.0)
@@ -284,16 +298,20 @@ def test_scheduled_events():
     system = Switched(duty=0.3)
     cycle = hj.find_limit_cycle(system)
     grow = np.exp(0.5)  # from the middle of the stay in `off` to its end, backwards
-    assert_allclose(cycle.anchor.q[0, 0], system.exact() * grow, rtol=1e-11)
+    expected = system.exact() * grow
+    assert_allclose(cycle.anchor.q[0, 0], expected, rtol=1e-11)
     assert_allclose(cycle.multipliers, [np.exp(-1.0)], atol=1e-11)
     # Sections at the very instants of the switches: the state after the switch, each just once.
     placed = hj.sections.place_sections(cycle, hj.ClockPhase(10))
     on = np.arange(10) < 3
     assert_array_equal(placed.lanes.chart, np.where(on, 0, 1))
-    assert_allclose(placed.lanes.q[0, 0], system.exact(), rtol=1e-11)
+    height = placed.lanes.q[0, 0]
+    assert_allclose(height, system.exact(), rtol=1e-11)
     ldtp = hj.linearize(cycle, placed)
-    assert_allclose(ldtp.A[:, 0, 0], np.exp(-0.1), rtol=1e-11)
-    assert_allclose(ldtp.B[:, 0, 0], on * (1 - np.exp(-0.1)), atol=1e-12)
+    decay = np.exp(-0.1)
+    assert_allclose(ldtp.A[:, 0, 0], decay, rtol=1e-11)
+    expected_push = on * (1 - np.exp(-0.1))
+    assert_allclose(ldtp.B[:, 0, 0], expected_push, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -307,7 +325,8 @@ def test_an_event_may_pass_the_phase_at_which_a_guess_begins(hopper_cycle):
 def test_damped_steps_reach_a_cycle_that_newtons_method_misses():
     """The juggler's unstable cycle; its trace and that of the stable one have the mean 1 + e^2."""
     juggler = hj.models.PaddleJuggler()
-    cycle = hj.find_limit_cycle(juggler, hj.Guess("fall", (1.3, -1.0), 0.56))
+    guess = hj.Guess("fall", (1.3, -1.0), 0.56)
+    cycle = hj.find_limit_cycle(juggler, guess)
     e = juggler.restitution
     stable = hj.find_limit_cycle(juggler)
     assert_allclose(np.prod(cycle.multipliers), e**2, rtol=1e-9)

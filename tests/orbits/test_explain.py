@@ -29,13 +29,19 @@ class Balls(hj.HybridSystem):
 
         def impact(k, retention):
             def guard(t, q, u):
-                return q[2 * k] - A * jnp.sin(w * t)
+                table = A * jnp.sin(w * t)
+                return q[2 * k] - table
 
             def reset(t, q, u):
-                v = -retention * q[2 * k + 1] + (1 + retention) * A * w * jnp.cos(w * t)
-                height = q[2 - 2 * k] - A * jnp.sin(w * t)  # of the other ball
-                q = jnp.asarray(q).at[2 * k + 1].set(v)
-                return q.at[2 * k + 1].add(self.coupling * height)
+                kept = -retention * q[2 * k + 1]
+                table_speed = A * w * jnp.cos(w * t)
+                v = kept + (1 + retention) * table_speed
+                table_height = A * jnp.sin(w * t)
+                height = q[2 - 2 * k] - table_height  # of the other ball
+                place = 2 * k + 1
+                q = jnp.asarray(q).at[place].set(v)
+                change = self.coupling * height
+                return q.at[2 * k + 1].add(change)
 
             return hj.Transition(f"impact{k}", "air", "air", guard, reset=reset)
 
@@ -47,7 +53,8 @@ class Balls(hj.HybridSystem):
 
 # A ball that falls through its floor, whose guard should rise.
 def above_floor(t, q, u):
-    return q[0] - 0.1 * jnp.sin(2 * jnp.pi * t)
+    wave = jnp.sin(2 * jnp.pi * t)
+    return q[0] - 0.1 * wave
 
 
 def air_rates(t, q, u):
@@ -67,7 +74,9 @@ WRONG_WAY = toy(
 
 # A pushed mass on a spring with a dashpot that is much too strong.
 def force(t, q):
-    return -1e5 * q[0] - 3e3 * q[1] + 20 * jnp.sin(2 * jnp.pi * t)
+    spring = -1e5 * q[0] - 3e3 * q[1]
+    table = jnp.sin(2 * jnp.pi * t)
+    return spring + 20 * table
 
 
 def rates(t, q, u):
@@ -94,7 +103,8 @@ def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
     }
     z = 0.399920196836063 + 0.574511824214789j
     assert_allclose(cycle.multipliers.real, [z.real] * 4, rtol=1e-7)
-    assert_allclose(np.abs(cycle.multipliers.imag), [z.imag] * 4, rtol=1e-7)
+    frequencies = np.abs(cycle.multipliers.imag)
+    assert_allclose(frequencies, [z.imag] * 4, rtol=1e-7)
 
 
 def test_events_whose_order_matters_have_a_derivative_for_each():
@@ -113,9 +123,13 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
     # The balls from half a tenth of a second before the impacts to as long after them.
     half = 0.05
     orbit = cycle.trajectory(2.0)
-    is_impact = (orbit.event >= 0) & (orbit.t > both.time - 1e-6)
-    y, v = orbit.before[np.flatnonzero(is_impact)[0], :2]
-    ball = [y - v * half - 9.81 * half**2 / 2, v + 9.81 * half]
+    is_late = orbit.t > both.time - 1e-6
+    is_impact = (orbit.event >= 0) & is_late
+    row = np.flatnonzero(is_impact)[0]
+    y, v = orbit.before[row, :2]
+    fallen = 9.81 * half**2 / 2
+    height = y - v * half - fallen
+    ball = [height, v + 9.81 * half]
     start = np.array([*ball, *ball])
     fall = np.kron(np.eye(2), [[1.0, half], [0.0, 1.0]])
 

@@ -52,11 +52,15 @@ def test_derivatives_at_a_fixed_energy_and_by_the_energy(running):
 
     k = jnp.array(20000.0)
     energy = jnp.array(1784.8)
-    _, by_k = jax.jvp(height, (k, energy), (1.0, 0.0))
-    _, by_energy = jax.jvp(height, (k, energy), (0.0, 1.0))
-    difference = height(k + 4.0, energy) - height(k - 4.0, energy)
+    along_k = (1.0, 0.0)
+    _, by_k = jax.jvp(height, (k, energy), along_k)
+    along_energy = (0.0, 1.0)
+    _, by_energy = jax.jvp(height, (k, energy), along_energy)
+    above = height(k + 4.0, energy)
+    difference = above - height(k - 4.0, energy)
     assert_allclose(by_k, difference / 8.0, rtol=1e-5)
-    difference = height(k, energy + 0.05) - height(k, energy - 0.05)
+    more = height(k, energy + 0.05)
+    difference = more - height(k, energy - 0.05)
     assert_allclose(by_energy, difference / 0.1, rtol=1e-5)
 
 
@@ -68,7 +72,8 @@ def rates(t, q, u):
     return (q[1], -q[0])
 
 
-CIRCLES = toy({"a": Field(("x", "v"), rates)}, outputs=(ENERGY,))
+chart = Field(("x", "v"), rates)
+CIRCLES = toy({"a": chart}, outputs=(ENERGY,))
 
 
 def find(**conserved):

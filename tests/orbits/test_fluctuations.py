@@ -21,22 +21,26 @@ def paddle(t):
 
 
 def slope(t):
-    return 0.3 * np.pi * np.cos(2 * np.pi * t)
+    phase = 2 * np.pi * t
+    return 0.3 * np.pi * np.cos(phase)
 
 
 def bend(t):
-    return -0.6 * np.pi**2 * np.sin(2 * np.pi * t)
+    phase = 2 * np.pi * t
+    return -0.6 * np.pi**2 * np.sin(phase)
 
 
 @pytest.fixture(scope="module")
 def juggler():
-    return hj.find_limit_cycle(Juggler(), hj.Guess("fall", (0.2, 4.5), time=0.1))
+    guess = hj.Guess("fall", (0.2, 4.5), time=0.1)
+    return hj.find_limit_cycle(Juggler(), guess)
 
 
 def _at_impact(cycle):
     orbit = cycle.trajectory()
     (impact,) = orbit.events
-    return impact.time, float(orbit.after[list(orbit.t).index(impact.time)][1])
+    k = list(orbit.t).index(impact.time)
+    return impact.time, float(orbit.after[k][1])
 
 
 @pytest.mark.core
@@ -48,7 +52,8 @@ def test_the_jitter_of_integrate_and_fire_neurons_has_its_closed_form():
     assert_allclose(threshold.diffusion, 0.05**2 / period, rtol=1e-12)
     assert_allclose(threshold.durations(lag=1), 0, rtol=0, atol=1e-17)
     white = cycle.fluctuations(white={"u": 0.01})  # its integral with exp(t) / 1.2
-    assert_allclose(white.durations(), [[1e-4 * 35 / 2 / 1.44]], rtol=1e-12)
+    expected = 1e-4 * 35 / 2 / 1.44
+    assert_allclose(white.durations(), [[expected]], rtol=1e-12)
     assert "standard deviation from spike to spike" in str(white)
 
 
@@ -66,18 +71,26 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
     noisy = cycle.fluctuations({"x": strength})
 
     # The amplitude r follows r' = -2 mu r + cos(omega t) dW.
-    double = 0.4 * np.cos(2 * angle) + 2 * omega * np.sin(2 * angle)
-    variance = strength**2 / 2 * (1 / 0.4 + double / (0.4**2 + 4 * omega**2))
+    even = 0.4 * np.cos(2 * angle)
+    odd = 2 * omega * np.sin(2 * angle)
+    double = even + odd
+    size = 0.4**2 + 4 * omega**2
+    sum_of_rates = 1 / 0.4 + double / size
+    variance = strength**2 / 2 * sum_of_rates
     # At equal phases d angle = alpha dr / r, so that deviations have one direction.
     x = np.cos(angle) - alpha * np.sin(angle)
     y = np.sin(angle) + alpha * np.cos(angle)
     now = noisy.covariance(phases)
-    assert_allclose(now[:, 0, 1], variance * x * y, rtol=1e-11)
+    expected_now = variance * x * y
+    assert_allclose(now[:, 0, 1], expected_now, rtol=1e-11)
     later = noisy.covariance(phases, 1)
     decay = np.exp(-2 * mu * 2 * np.pi / omega)
-    assert_allclose(later[:, 1, 1], decay * variance * y**2, rtol=1e-11)
+    expected_later = decay * variance * y**2
+    assert_allclose(later[:, 1, 1], expected_later, rtol=1e-11)
 
-    diffusion = strength**2 * (1 + alpha**2) / (2 * mu) / omega**2
+    shear = 1 + alpha**2
+    relative = strength**2 * shear / (2 * mu)
+    diffusion = relative / omega**2
     assert_allclose(noisy.diffusion, diffusion, rtol=1e-11)
     # Periods are correlated, and over many of them their variance is that of the diffusion.
     alone = noisy.durations()[0, 0]
@@ -87,8 +100,11 @@ def test_a_noisy_stuart_landau_oscillator_has_its_closed_form():
 
 
 def test_states_may_have_no_correlation():
-    noisy = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0)).fluctuations({"u": 0.2})
-    assert_allclose(noisy.covariance([0.3])[0], 0.1 * np.eye(2), rtol=0, atol=1e-12)
+    cycle = hj.find_limit_cycle(hj.models.Mathieu(epsilon=0.0))
+    noisy = cycle.fluctuations({"u": 0.2})
+    expected = 0.1 * np.eye(2)
+    computed = noisy.covariance([0.3])[0]
+    assert_allclose(computed, expected, rtol=0, atol=1e-12)
 
 
 def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
@@ -99,30 +115,41 @@ def test_a_noisy_juggler_has_the_closed_form_of_its_bounces(juggler):
     relative = landing - slope(t)
 
     # How the next time, height and speed depend on those of this bounce.
-    time = np.array([landing, -1.0, -1.0]) / relative
+    changes = np.array([landing, -1.0, -1.0])
+    time = changes / relative
     duration = time - [1, 0, 0]
     height = slope(t) * time
-    speed = 1.7 * bend(t) * time + 0.7 * G * duration - [0, 0, 0.7]
+    by_bend = 1.7 * bend(t) * time
+    by_fall = 0.7 * G * duration
+    speed = by_bend + by_fall - [0, 0, 0.7]
     step = np.stack([time, height, speed])
     # How they depend on a height of the table, and on a speed that is added after the bounce.
-    by_time = np.array([1.0, slope(t), 1.7 * bend(t) + 0.7 * G])
+    change = 1.7 * bend(t) + 0.7 * G
+    by_time = np.array([1.0, slope(t), change])
     by_table = by_time / relative + [0, 1, 0]
-    noise = TABLE**2 * np.outer(by_table, by_table) + np.diag([0, 0, SPEED**2])
+    of_table = np.outer(by_table, by_table)
+    of_speed = np.diag([0, 0, SPEED**2])
+    noise = TABLE**2 * of_table + of_speed
     C = solve_discrete_lyapunov(step, noise)
 
     since = float(juggler.anchor.t[0]) + 1 - t  # from a bounce to the anchor
-    now = np.array([[-(v - G * since), 1.0, since], [G, 0.0, 1.0]])
+    speed_there = v - G * since
+    now = np.array([[-speed_there, 1.0, since], [G, 0.0, 1.0]])
     expected = now @ C @ now.T
     assert_allclose(noisy.covariance([0.0])[0], expected, rtol=1e-11)
     expected = now @ step @ step @ C @ now.T
-    assert_allclose(noisy.covariance([0.0], 2)[0], expected, rtol=1e-11)
+    computed_later = noisy.covariance([0.0], 2)[0]
+    assert_allclose(computed_later, expected, rtol=1e-11)
 
     # A duration is the difference of two times.
-    times = [C[0, 0], (step @ C)[0, 0], (step @ step @ C)[0, 0]]
+    once = step @ C
+    twice = step @ step @ C
+    times = [C[0, 0], once[0, 0], twice[0, 0]]
     expected = 2 * (times[0] - times[1])
     assert_allclose(noisy.durations()[0, 0], expected, rtol=1e-12)
     expected = 2 * times[1] - times[0] - times[2]
-    assert_allclose(noisy.durations(1)[0, 0], expected, rtol=1e-11)
+    found = noisy.durations(1)[0, 0]
+    assert_allclose(found, expected, rtol=1e-11)
 
 
 def test_a_million_simulated_bounces_scatter_as_computed(juggler):
@@ -139,22 +166,27 @@ def test_a_million_simulated_bounces_scatter_as_computed(juggler):
         table = TABLE * rng.normal(size=jugglers)
         duration = np.ones(jugglers)
         for _ in range(8):  # Newton's method
-            height = y + v * duration - G / 2 * duration**2
+            fallen = G / 2 * duration**2
+            height = y + v * duration - fallen
             gap = height - paddle(t + duration) - table
             rate = v - G * duration - slope(t + duration)
             duration = duration - gap / rate
         t = t + duration
         y = paddle(t) + table
-        v = 1.7 * slope(t) - 0.7 * (v - G * duration)
+        impact = v - G * duration
+        v = 1.7 * slope(t) - 0.7 * impact
         v = v + SPEED * rng.normal(size=jugglers)
         if bounce >= transient:
             deviations.append(duration - 1)
     x = np.array(deviations)
     for lag in (0, 1, 2):
-        products = x[lag:] * x[: len(x) - lag]
+        later = x[lag:]
+        earlier = x[: len(x) - lag]
+        products = later * earlier
         covariance = products.mean(axis=0)  # of each of the independent jugglers
         standard_error = covariance.std(ddof=1) / np.sqrt(jugglers)
-        error = covariance.mean() - noisy.durations(lag)[0, 0]
+        computed = noisy.durations(lag)[0, 0]
+        error = covariance.mean() - computed
         assert abs(error) < 3 * standard_error, f"lag {lag}"
 
 
@@ -183,7 +215,8 @@ class _Adaptive(hj.Chart):
     states = ("v", "w")
 
     def field(self, t, q, u):
-        return 1.2 - q[0], q[0] - q[1] + u[0]
+        follow = q[0] - q[1] + u[0]
+        return 1.2 - q[0], follow
 
 
 class _Follower(hj.HybridSystem):
@@ -203,7 +236,8 @@ class _Follower(hj.HybridSystem):
 
 
 def test_noise_without_an_effect_gives_zero():
-    cycle = hj.find_limit_cycle(_Follower(), hj.Guess("sub", (0.5, 1.0)))
+    guess = hj.Guess("sub", (0.5, 1.0))
+    cycle = hj.find_limit_cycle(_Follower(), guess)
     follower = np.array([[0, 0], [0, 0.2**2 / 2]])  # w' = -w + noise, unless v matters
     for strength, expected in (({"u": 0.2}, follower), ({"idle": 0.2}, 0 * follower)):
         noisy = cycle.fluctuations(white=strength)

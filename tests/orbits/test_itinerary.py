@@ -23,7 +23,9 @@ class Free(hj.Chart):
     def field(self, t, q, u):
         x, v = q
         s = self.system
-        return v, -x - s.damping * v + s.drive * jnp.cos(s.rate * t) + u[0]
+        push = s.drive * jnp.cos(s.rate * t)
+        spring = -x - s.damping * v
+        return v, spring + push + u[0]
 
 
 class Rebound(hj.HybridSystem):
@@ -98,7 +100,8 @@ def compiled(monkeypatch):
 
 def amplitude(drive):
     """Of the free motion, in closed form."""
-    return drive / np.hypot(1 - 1.3**2, 0.4 * 1.3)
+    impedance = np.hypot(1 - 1.3**2, 0.4 * 1.3)
+    return drive / impedance
 
 
 def damping_of_a_turn():
@@ -109,7 +112,8 @@ def damping_of_a_turn():
 def test_a_repeated_cycle_is_that_of_the_closed_form(free, compiled):
     cycle = hj.find_limit_cycle(Rebound(drive=0.5), free)
     _, _, states = cycle.trajectory().dense(64)
-    assert_allclose(np.max(states[:, 0]), amplitude(0.5), rtol=1e-3)
+    largest = np.max(states[:, 0])
+    assert_allclose(largest, amplitude(0.5), rtol=1e-3)
     product = np.prod(cycle.multipliers).real
     assert_allclose(product, damping_of_a_turn(), rtol=0, atol=1e-11)
 
@@ -137,7 +141,9 @@ def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
 def test_an_event_in_the_last_step_of_a_turn_is_noticed():
     """Also if the guard is positive again where the turn ends."""
     gain = amplitude(1.0)
-    peak = np.arctan2(0.4 * 1.3, 1 - 1.3**2) / 1.3
+    quadrature = 0.4 * 1.3
+    in_phase = 1 - 1.3**2
+    peak = np.arctan2(quadrature, in_phase) / 1.3
     after = hj.Guess("free", (0.9, -0.1), time=peak + 0.1)
     known = hj.find_limit_cycle(Rebound(drive=0.99 / gain), after)
 
@@ -164,11 +170,15 @@ def test_gradients_inside_of_programs_are_differences():
     value = jax.jit(state)
     at = np.array([2.0, 0.4, 1.3])
     h = 1e-4
-    gradient = jax.jit(jax.grad(state, argnums=(0, 1, 2)))(*at)
+    of_state = jax.grad(state, argnums=(0, 1, 2))
+    gradient = jax.jit(of_state)(*at)
     for slope, step in zip(gradient, h * np.eye(3), strict=True):
-        difference = (value(*(at + step)) - value(*(at - step))) / (2 * h)
+        higher = value(*(at + step))
+        change = higher - value(*(at - step))
+        difference = change / (2 * h)
         assert_allclose(slope, difference, rtol=1e-6)
-    forwards = jax.jit(jax.jacfwd(state, argnums=(0, 1, 2)))(*at)
+    jacobian = jax.jacfwd(state, argnums=(0, 1, 2))
+    forwards = jax.jit(jacobian)(*at)
     assert_allclose(forwards, gradient, rtol=1e-10)
 
 
@@ -181,7 +191,8 @@ def test_repeated_gradients_outside_of_programs_are_those_of_the_search(monkeypa
     def coefficient(drive, damping):
         cycle = hj.find_limit_cycle(Rebound(drive=drive, damping=damping), known)
         model = hj.linearize(cycle, family, ("x",))
-        return model.characteristic_polynomial()[1] + model.B[0, 0, 0]
+        coefficients = model.characteristic_polynomial()
+        return coefficients[1] + model.B[0, 0, 0]
 
     gradient = jax.grad(coefficient, argnums=(0, 1))
     drives = 2.0, 2.001, 0.5
@@ -196,9 +207,13 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     monkeypatch.setattr(limit_cycles, "WORTH_COMPILING", 1)
     # (No system is left to the search side by side, which would hide faults of routes.)
     monkeypatch.setattr(batches.Tiles, "solve", None)
-    k, b = np.meshgrid(np.linspace(8, 13, 8), np.linspace(3, 7, 8))
+    stiffness = np.linspace(8, 13, 8)
+    damping = np.linspace(3, 7, 8)
+    k, b = np.meshgrid(stiffness, damping)
     make = eqx.filter_vmap(lambda k, b: hj.models.VerticalHopper(k=k, b=b))
-    systems = make(jnp.asarray(k.ravel()), jnp.asarray(b.ravel()))
+    all_k = jnp.asarray(k.ravel())
+    all_b = jnp.asarray(b.ravel())
+    systems = make(all_k, all_b)
     guess = hj.find_limit_cycle(hj.models.VerticalHopper())
     cycles = hj.orbits.find_limit_cycles(systems, guess)
     assert cycles.ok.all()
@@ -207,14 +222,16 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     for i in (0, 7, 20, 63, int(np.argmin(charts))):
         alone = hj.find_limit_cycle(cycles[i].system)
         found = cycles.multipliers[i][: len(alone.multipliers)]
-        assert np.allclose(np.sort(found), np.sort(alone.multipliers), atol=1e-8)
+        expected = np.sort(alone.multipliers)
+        assert np.allclose(np.sort(found), expected, atol=1e-8)
 
 
 def test_programs_of_many_systems_factorize_nothing(free):
     """XLA's pool would deadlock on LAPACK's calls for many matrices at once."""
     route = near.route_near(free)
     leaves = tuple(np.repeat(np.asarray(x)[None], 4, 0) for x in leaves_of(free.system))
-    times = np.zeros(4), np.full(4, float(free.period))
+    periods = np.full(4, float(free.period))
+    times = np.zeros(4), periods
     q = np.repeat(route.map.anchor.q.T, 4, axis=0)
     ends = np.repeat(route.first.ends[None], 4, axis=0)
     map = on_device(route.map)
@@ -223,7 +240,9 @@ def test_programs_of_many_systems_factorize_nothing(free):
     def program(leaves, t, expected, q, ends):
         return correct(Maps(map, leaves, t, expected), plan, q, ends)
 
-    text = jax.jit(program).lower(leaves, *times, q, ends).as_text()
+    compiled = jax.jit(program)
+    lowered = compiled.lower(leaves, *times, q, ends)
+    text = lowered.as_text()
     assert "while" in text
     assert "@lapack_" not in text
 
@@ -240,11 +259,14 @@ def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
 
 def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     """The turn ends with the tick `up`, which comes later than the turn in other systems."""
-    cycle = hj.find_limit_cycle(Pulses(rise=0.05), hj.find_limit_cycle(Pulses()))
+    known = hj.find_limit_cycle(Pulses())
+    cycle = hj.find_limit_cycle(Pulses(rise=0.05), known)
     path = cycle.trajectory()
     after = np.flatnonzero(path.event == 0)[0]
     # In closed form, the charge with which a pulse of 0.35 begins.
-    begin = np.exp(-0.65) * (1 - np.exp(-0.35)) / (1 - np.exp(-1.0))
+    later = 1 - np.exp(-0.35)
+    rise = np.exp(-0.65) * later
+    begin = rise / (1 - np.exp(-1.0))
     error = abs(path.after[after, 0] - begin)
     assert error < 1e-10
 
@@ -276,7 +298,8 @@ def test_an_event_whose_predicate_fails_beside_the_known_cycle_is_noticed(compil
     passing = hj.find_limit_cycle(Stop(drive=2.0, least=2 * fastest), known)
     assert passing.event_sequence == ()
     _, _, states = passing.trajectory().dense(64)
-    assert_allclose(np.max(states[:, 0]), amplitude(2.0), rtol=1e-3)
+    largest = np.max(states[:, 0])
+    assert_allclose(largest, amplitude(2.0), rtol=1e-3)
 
 
 class Falling(hj.Chart):
@@ -336,7 +359,9 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
     up = hj.find_limit_cycle(Thrower(speed=0.1, pull=2.0))
     assert_allclose(down.period, 1, rtol=1e-12)
     # The height is reached at 0.1 t + t^2 = 1.2.
-    assert_allclose(up.period, 1 - 0.05 + np.sqrt(0.05**2 + 1.2), rtol=1e-9)
+    root = np.sqrt(0.05**2 + 1.2)
+    expected = 1 - 0.05 + root
+    assert_allclose(up.period, expected, rtol=1e-9)
 
     @jax.jit
     def below(speed):
@@ -348,10 +373,12 @@ def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
         cycle = hj.find_limit_cycle(Thrower(speed=speed, pull=2.0), up)
         return cycle.period, cycle.result
 
-    assert_allclose(below(-0.4), (1, hj.errors.Result.OK))
+    expected_below = (1, hj.errors.Result.OK)
+    assert_allclose(below(-0.4), expected_below)
     assert below(1.0)[1] == hj.errors.Result.EVENT_ORDER
     rise = -0.025 + np.sqrt(0.025**2 + 1.2)
-    assert_allclose(above(0.05), (1 + rise, hj.errors.Result.OK))
+    expected_above = (1 + rise, hj.errors.Result.OK)
+    assert_allclose(above(0.05), expected_above)
     assert above(-0.05)[1] == hj.errors.Result.EVENT_ORDER
 
 
@@ -386,14 +413,17 @@ def test_guards_that_have_fallen_in_the_same_chart_are_not_due_again():
         found = hj.find_limit_cycle(Marked(rate=rate), cycle)
         return found.period, found.result
 
-    assert_allclose(beside(1.1), (np.log(2) / 1.1, hj.errors.Result.OK), rtol=1e-9)
+    expected = (np.log(2) / 1.1, hj.errors.Result.OK)
+    assert_allclose(beside(1.1), expected, rtol=1e-9)
 
 
 class Detuned(Free):
     def field(self, t, q, u):
         x, v = q
         s = self.system
-        return v, -x - s.damping * v + s.drive * jnp.cos((s.rate + s.detuned) * t)
+        rate = s.rate + s.detuned
+        push = s.drive * jnp.cos(rate * t)
+        return v, -x - s.damping * v + push
 
 
 class Driven(Rebound):
@@ -428,12 +458,14 @@ def test_a_lane_without_a_cycle_has_no_derivative(free):
     """In reverse mode. The others keep theirs: that of x(0) in closed form."""
 
     def begin(drive):
-        return hj.find_limit_cycle(Rebound(drive=drive), free).anchor.q[0, 0]
+        rebound = hj.find_limit_cycle(Rebound(drive=drive), free)
+        return rebound.anchor.q[0, 0]
 
     drives = jnp.array([0.3, jnp.nan, 0.4])
     values = jax.vmap(jax.grad(begin))(drives)
     assert np.isnan(values[1])
-    expected = np.real(1 / (1 - 1.3**2 + 0.4j * 1.3))
+    response = 1 / (1 - 1.3**2 + 0.4j * 1.3)
+    expected = np.real(response)
     assert_allclose(values[::2], [expected, expected], rtol=1e-8)
 
 
@@ -492,7 +524,8 @@ class Window(hj.HybridSystem):
 
     def charts(self):
         def rate(t, q, u):
-            return (self.size * (1 + jnp.sin(2 * jnp.pi * t)) - q[0],)
+            wave = 1 + jnp.sin(2 * jnp.pi * t)
+            return (self.size * wave - q[0],)
 
         return {"follows": Field(("x",), rate)}
 
@@ -521,13 +554,17 @@ class Window(hj.HybridSystem):
 @pytest.mark.slow
 def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
     """Not at the ends of a step, but at the zero of the guard within."""
-    cycle = hj.find_limit_cycle(Window(), hj.Guess("follows", (0.5,)))
+    guess = hj.Guess("follows", (0.5,))
+    cycle = hj.find_limit_cycle(Window(), guess)
     sizes = np.linspace(0.5, 1.1, 13)
-    has_no_event = sizes * (1 + 1 / np.sqrt(1 + 4 * np.pi**2)) < 1
+    square = 1 + 4 * np.pi**2
+    ripple = 1 / np.sqrt(square)
+    has_no_event = sizes * (1 + ripple) < 1
     result = jax.jit(
         jax.vmap(lambda size: hj.find_limit_cycle(Window(size), cycle).result)
     )
-    found = result(jnp.asarray(sizes)) == hj.errors.Result.OK
+    codes = result(jnp.asarray(sizes))
+    found = codes == hj.errors.Result.OK
     np.testing.assert_array_equal(found, has_no_event)
     for _ in range(4):  # (by a search, and by the known itinerary)
         beside = hj.find_limit_cycle(Window(1.0), cycle, throw=False)
@@ -541,9 +578,13 @@ def test_a_guard_that_a_reset_puts_on_its_zero_is_not_about_to_fall(monkeypatch)
     # (Systems that seem to leave the itinerary would be searched.)
     monkeypatch.setattr(batches.Tiles, "solve", None)
     monkeypatch.setattr(limit_cycles, "_search", None)
-    hip, leg = np.meshgrid(np.linspace(9.5, 10.5, 6), np.linspace(4.9, 5.1, 6))
+    hips = np.linspace(9.5, 10.5, 6)
+    legs = np.linspace(4.9, 5.1, 6)
+    hip, leg = np.meshgrid(hips, legs)
     make = eqx.filter_vmap(lambda mH, m: hj.models.CompassGait(mH=mH, m=m))
-    systems = make(jnp.asarray(hip.ravel()), jnp.asarray(leg.ravel()))
+    all_hips = jnp.asarray(hip.ravel())
+    all_legs = jnp.asarray(leg.ravel())
+    systems = make(all_hips, all_legs)
 
     guess = hj.find_limit_cycle(hj.models.CompassGait())
     cycles = hj.orbits.find_limit_cycles(systems, guess)

@@ -26,7 +26,9 @@ class Turning(hj.Chart):
 
     def field(self, t, q, u):
         x, v = q
-        return v, (1 - x**2) * v - x + self.further(x) + u[0]
+        damping = (1 - x**2) * v
+        force = damping - x + self.further(x)
+        return v, force + u[0]
 
 
 class Turns(hj.HybridSystem):
@@ -112,7 +114,8 @@ def test_simulations_end_at_what_steps_pass_over():
     pulse = Turns(lambda x: jnp.exp(-(((x - 0.5) / 1e-4) ** 2)))
 
     def dip(t, q, u):
-        return 1.0 - 2.0 * jnp.exp(-(((t - 0.4321) / 1e-3) ** 2))
+        distance = (t - 0.4321) / 1e-3
+        return 1.0 - 2.0 * jnp.exp(-(distance**2))
 
     def dip_reset(t, q, u):
         return q
@@ -126,7 +129,8 @@ def test_simulations_end_at_what_steps_pass_over():
 
 def test_a_guard_without_derivative_does_not_pass_as_one_that_never_falls():
     def level(t, q, u):
-        return 1.5 + 0.1 * jnp.maximum(0.5 - q[0], 0.0) ** 0.0 - q[0]
+        inside = jnp.maximum(0.5 - q[0], 0.0)
+        return 1.5 + 0.1 * inside**0.0 - q[0]
 
     def stop_reset(t, q, u):
         return q
@@ -144,7 +148,8 @@ class Pushed(Turning):
 
     def field(self, t, q, u):
         x, v = q
-        pulse = 0.4 * jnp.exp(-(((t % 1.3 - 0.33) / 0.0055) ** 2))
+        distance = (t % 1.3 - 0.33) / 0.0055
+        pulse = 0.4 * jnp.exp(-(distance**2))
         return v, -3 * x - 0.7 * v + 2 * jnp.cos(2 * jnp.pi * t / 1.3) + u[0] * (
             1 + pulse
         )

@@ -28,8 +28,12 @@ class StuartLandau(hj.HybridSystem):
         return {"plane": FieldChart(self.field, ("x", "y"))}
 
     def field(self, t, q, u):
-        z = self.growth(q[0] ** 2 + q[1] ** 2)
-        return z[0] * q[0] - z[1] * q[1] + u[0], z[1] * q[0] + z[0] * q[1]
+        square = q[0] ** 2 + q[1] ** 2
+        z = self.growth(square)
+        turned = z[0] * q[0] - z[1] * q[1]
+        x = turned + u[0]
+        y = z[1] * q[0] + z[0] * q[1]
+        return x, y
 
     def growth(self, r2):
         return self.mu - r2, self.eta - self.alpha * r2
@@ -48,7 +52,9 @@ class Neuron(hj.HybridSystem):
         return {"membrane": FieldChart(self.field, ("v",))}
 
     def field(self, t, q, u):
-        return (self.current - self.leak * q[0] + self.square * q[0] ** 2 + u[0],)
+        leak = self.leak * q[0]
+        square = self.square * q[0] ** 2
+        return (self.current - leak + square + u[0],)
 
     def transitions(self):
         def guard(t, q, u):
@@ -72,7 +78,9 @@ class Driven(hj.HybridSystem):
         return {"plane": FieldChart(self.field, ("x", "y"))}
 
     def field(self, t, q, u):
-        return self.force * jnp.cos(2 * jnp.pi * t) - q[0], 1e12 * q[0] - q[1]
+        wave = jnp.cos(2 * jnp.pi * t)
+        fast = 1e12 * q[0] - q[1]
+        return self.force * wave - q[0], fast
 
     def period(self):
         return 1.0
@@ -87,7 +95,11 @@ class Square(hj.HybridSystem):
     WALLS = (("right", 0, 1), ("top", 1, 1), ("left", 0, -1), ("bottom", 1, -1))
 
     def rates(self, q):
-        return self.a * q[0] - self.omega * q[1], self.omega * q[0] + self.a * q[1]
+        grown = self.a * q[0]
+        x = grown - self.omega * q[1]
+        grown = self.a * q[1]
+        y = self.omega * q[0] + grown
+        return x, y
 
     def charts(self):
         def inside_rates(t, q, u):
@@ -137,7 +149,8 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     responses = hj.find_limit_cycle(system, guess, section=section).responses()
     angle = 2 * np.pi * PHASES
     phase = responses.phase(PHASES, "radians")
-    exact = -(np.sin(angle) - 0.4 * np.cos(angle)) / np.sqrt(0.1)
+    wave = np.sin(angle) - 0.4 * np.cos(angle)
+    exact = -wave / np.sqrt(0.1)
     assert_allclose(phase["u"], exact, rtol=0, atol=1e-12)
     assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
     amplitude = responses.amplitude(0, PHASES)
@@ -153,7 +166,9 @@ def test_a_stuart_landau_oscillator_responds_as_its_closed_form():
     # Isochrons are logarithmic spirals: phase = angle + alpha log(r / sqrt(mu)).
     cycle = hj.find_limit_cycle(system, guess, section=section)
     phase = cycle.asymptotic_phase("plane", (0.3, 0.15))
-    exact = np.arctan2(0.15, 0.3) + 0.4 * np.log(np.hypot(0.3, 0.15) / np.sqrt(0.1))
+    distance = np.hypot(0.3, 0.15) / np.sqrt(0.1)
+    shear = 0.4 * np.log(distance)
+    exact = np.arctan2(0.15, 0.3) + shear
     assert_allclose(phase, exact / (2 * np.pi), rtol=1e-9)
 
 
@@ -163,7 +178,8 @@ def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
 
     class Scaled(StuartLandau):
         def field(self, t, q, u):
-            x, y = super().field(t, (q[0], q[1] / size), u)
+            scaled = (q[0], q[1] / size)
+            x, y = super().field(t, scaled, u)
             return x, y * size
 
     section = hj.Crossing("y", "rising")
@@ -175,18 +191,21 @@ def test_responses_and_sensitivities_do_not_depend_on_the_units_of_states():
     phase = cycle.responses().phase(PHASES, "radians")
     assert_allclose(phase["x"], exact, rtol=0, atol=1e-12)
     slower = cycle.sensitivity("mu").period
-    assert_allclose(slower, -2 * np.pi * 0.4 / 1.04**2, rtol=1e-11)
+    expected = -2 * np.pi * 0.4 / 1.04**2
+    assert_allclose(slower, expected, rtol=1e-11)
     driven = hj.find_limit_cycle(Driven(), hj.Guess("plane", (0.1, 1e11)))
     shape = driven.sensitivity("force").shape([0.0])
     state = driven.state
-    assert_allclose([shape[x][0] / state[x] for x in "xy"], 1.0, rtol=1e-11)
+    relative = [shape[x][0] / state[x] for x in "xy"]
+    assert_allclose(relative, 1.0, rtol=1e-11)
 
 
 def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
     """x' = cos(2 pi t) - 0.3 x, and x changes its sign at each tick."""
 
     def field(t, q, u):
-        return (jnp.cos(2 * jnp.pi * t) - 0.3 * q[0] + u[0],)
+        wave = jnp.cos(2 * jnp.pi * t)
+        return (wave - 0.3 * q[0] + u[0],)
 
     tick = hj.systems.Scheduled(1.0, 0.5)
 
@@ -194,11 +213,16 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
         return (-q[0],)
 
     turned = hj.Transition("tick", "line", "line", tick, reset=tick_reset)
-    system = toy({"line": FieldChart(field, ("x",))}, [turned], period=1.0)
-    responses = hj.find_limit_cycle(system, hj.Guess("line", (0.1,))).responses()
-    assert_allclose(responses.exponents, [-0.3 + 1j * np.pi], rtol=1e-12)
+    chart = FieldChart(field, ("x",))
+    system = toy({"line": chart}, [turned], period=1.0)
+    cycle = hj.find_limit_cycle(system, hj.Guess("line", (0.1,)))
+    responses = cycle.responses()
+    expected = [-0.3 + 1j * np.pi]
+    assert_allclose(responses.exponents, expected, rtol=1e-12)
     before_tick = np.where(PHASES < 0.5, PHASES, PHASES - 1)
-    exact = np.exp(1j * np.pi * before_tick) * responses.amplitude(0, [0.0])["x"]
+    turn = np.exp(1j * np.pi * before_tick)
+    of_tick = responses.amplitude(0, [0.0])["x"]
+    exact = turn * of_tick
     assert_allclose(responses.amplitude(0, PHASES)["x"], exact, rtol=1e-11)
 
 
@@ -209,10 +233,12 @@ def test_the_closed_form_of_a_response_has_its_derivative():
 
     def response(mu):
         cycle = hj.find_limit_cycle(StuartLandau(mu=mu), near)
-        return cycle.responses(modes=0).phase(jnp.asarray(PHASES), "radians")["x"]
+        phases = jnp.asarray(PHASES)
+        return cycle.responses(modes=0).phase(phases, "radians")["x"]
 
     angle = 2 * np.pi * PHASES
-    exact = (np.sin(angle) - 0.4 * np.cos(angle)) / (2 * 0.1**1.5)
+    wave = np.sin(angle) - 0.4 * np.cos(angle)
+    exact = wave / (2 * 0.1**1.5)
     tangent = jax.jvp(response, (0.1,), (1.0,))[1]  # (in reverse mode: the slow test)
     assert_allclose(tangent, exact, rtol=0, atol=1e-9)
 
@@ -224,15 +250,18 @@ def test_weakly_pushed_and_coupled_oscillators_lock_as_their_closed_forms():
     pushed = responses.coupling(lambda phase: np.cos(2 * np.pi * phase))
     size = 1 / (4 * np.pi * np.sqrt(0.1))
     angle = 2 * np.pi * PHASES
-    expected = size * (np.sin(angle) + 0.4 * np.cos(angle))
+    wave = np.sin(angle) + 0.4 * np.cos(angle)
+    expected = size * wave
     assert_allclose(pushed(PHASES), expected, rtol=1e-11)
-    expected = np.array([-1, 1]) * size * np.sqrt(1.16)
+    both = np.array([-1, 1])
+    expected = both * size * np.sqrt(1.16)
     assert_allclose(pushed.locking, expected, rtol=1e-12)
     rates = [x.rate for x in pushed.locked()]
     expected = 2 * np.pi * size * np.sqrt(1.16)
     assert_allclose(np.abs(rates), expected, rtol=1e-11)
     together, apart = responses.coupling("x").locked(mutual=True)
-    assert_allclose([*together, *apart], [0, -1, 0.5, 1], rtol=0, atol=1e-12)
+    phases = [*together, *apart]
+    assert_allclose(phases, [0, -1, 0.5, 1], rtol=0, atol=1e-12)
     leads = [
         x.lead for x in type(pushed)(np.array([0.0, np.exp(0.5002j * np.pi)])).locked()
     ]
@@ -257,7 +286,12 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     with pytest.raises(hj.errors.DefinitionError, match="acts at events alone"):
         leaky.curve("u")
     # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
-    system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
+    system = Neuron(
+        current=1.0,
+        leak=0.0,
+        square=1.0,
+        low=-2.0,
+    )
     cycle = hj.find_limit_cycle(system)
     begin = np.arctan(-2.0)
     quadratic = cycle.responses()
@@ -265,7 +299,8 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     exact = np.cos(begin + PHASES * period) ** 2
     assert_allclose(quadratic.phase(PHASES)["u"], exact, rtol=1e-12)
     curve = quadratic.curve()
-    exact = np.cos(begin + curve.phase * period) ** 2 / period
+    angle = begin + curve.phase * period
+    exact = np.cos(angle) ** 2 / period
     kept = np.isfinite(curve.values)
     assert_allclose(curve.values[kept], exact[kept], rtol=1e-12)
     assert 0 < np.sum(~kept) <= 2
@@ -273,7 +308,8 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     change = cycle.sensitivity("low")  # T = arctan(1) - arctan(low)
     assert_allclose(change.period, -1 / 5, rtol=1e-11)
     assert_allclose(change.durations, [-1 / 5], rtol=1e-11)
-    assert_allclose(change.shape([0.0])["v"], [1.0], rtol=1e-11)
+    by_speed = change.shape([0.0])["v"]
+    assert_allclose(by_speed, [1.0], rtol=1e-11)
 
 
 @pytest.mark.core
@@ -285,11 +321,14 @@ def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_deri
     assert_allclose(a.period - omega.period, 10.784262213426, rtol=1e-9)
     assert_allclose(np.sum(a.durations), a.period, rtol=1e-9)
     # By symmetry each quarter takes its part.
-    measured = np.reshape(a.durations, (4, 2)).sum(1)
+    by_side = np.reshape(a.durations, (4, 2))
+    measured = by_side.sum(1)
     assert_allclose(measured, a.period / 4, rtol=1e-9)
     # A cycle that begins where sliding ends can be followed.
-    periods = [hj.find_limit_cycle(Square(a=x), cycle).period for x in (0.19, 0.21)]
-    assert_allclose(np.diff(periods)[0] / 0.02, a.period, rtol=1e-3)
+    squares = [Square(a=x) for x in (0.19, 0.21)]
+    periods = [hj.find_limit_cycle(square, cycle).period for square in squares]
+    slope = np.diff(periods)[0] / 0.02
+    assert_allclose(slope, a.period, rtol=1e-3)
 
 
 # All of `hj.models` without a clock, except a family of cycles (SLIPRunner).
@@ -316,25 +355,32 @@ def test_phase_responses_are_differences_of_asymptotic_phases(name):
     for k, a in enumerate(charts):
         names = s.charts[a].states
         q = states[k, : s.dims[a]]
-        push = 1e-4 * rng.normal(size=len(q)) * [cycle.scale[x] for x in names]
+        scales = [cycle.scale[x] for x in names]
+        push = 1e-4 * rng.normal(size=len(q)) * scales
         push *= [response[x][k] != 0 for x in names]  # sliding undoes the others
 
         def central(h):
             to = [cycle.asymptotic_phase(s.names[a], q + x * push) for x in (h, -h)]  # noqa: B023
-            return ((to[0] - to[1] + 0.5) % 1.0 - 0.5) / (2 * h)
+            half_turn_on = to[0] - to[1] + 0.5
+            apart = half_turn_on % 1.0 - 0.5
+            return apart / (2 * h)
 
-        difference.append((4 * central(0.5) - central(1.0)) / 3)
+        fourth_order = (4 * central(0.5) - central(1.0)) / 3
+        difference.append(fourth_order)
         exact.append(sum(response[x][k] * p for x, p in zip(names, push, strict=True)))
-    size = max(np.abs(np.concatenate([*response.values()]))) * 1e-4
+    all_responses = np.concatenate([*response.values()])
+    size = max(np.abs(all_responses)) * 1e-4
     assert_allclose(difference, exact, rtol=1e-6, atol=1e-6 * size)
 
 
 def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
     cycle = hj.find_limit_cycle(hj.models.BeltOscillator())
     flow = cycle.trajectory()
-    inside = (flow.chart == cycle.structure.chart_index("sticks")) & (flow.event < 0)
+    is_sliding = flow.chart == cycle.structure.chart_index("sticks")
+    inside = is_sliding & (flow.event < 0)
     sticks = flow.t[inside] - flow.t[0]
-    phase = cycle.responses().phase(sticks[:-1] / float(cycle.period))
+    phases = sticks[:-1] / float(cycle.period)
+    phase = cycle.responses().phase(phases)
     assert np.all(phase["v"] == 0)
     assert np.all(np.abs(phase["x"]) > 1)
     assert "2 faster modes left out" not in str(cycle.responses())
@@ -348,13 +394,16 @@ def test_mathieus_equation_has_the_published_continuous_htf():
         1.085149865188 - 0.060008477233j,
         0.333649918824 + 0.129840711721j,
     ]
-    assert_allclose(htf.H[:, 0, 0, 0], published, rtol=0, atol=1e-11)
+    computed = htf.H[:, 0, 0, 0]
+    assert_allclose(computed, published, rtol=0, atol=1e-11)
     assert "continuous time" in str(htf)
     assert htf[1].shape == (1, 1, 1)
     ldtp = hj.linearize(cycle, hj.ClockPhase(64), "x")
     held = ldtp.htf(0.25, (-1, 0, 1)).H
     x = 2j * np.pi * 0.25 / 64  # less aliases, the factor of the hold
-    assert_allclose(held * x / (1 - np.exp(-x)), htf.H, rtol=1e-7)
+    decay = np.exp(-x)
+    found = held * x / (1 - decay)
+    assert_allclose(found, htf.H, rtol=1e-7)
     with pytest.raises(hj.errors.DefinitionError, match="takes HTFs between sections"):
         htf.predict(np.ones((32, 1)))
 
@@ -364,7 +413,8 @@ def test_htfs_at_many_frequencies_come_from_fewer():
     f = np.linspace(0.013, 9.987, 620)
     some = [0, 7, 311, 619]
     many = cycle.htf(f, (-1, 0, 1)).H
-    few = cycle.htf(f[some], (-1, 0, 1)).H
+    response = cycle.htf(f[some], (-1, 0, 1))
+    few = response.H
     tolerance = 1e-12 * np.abs(few).max()
     assert_allclose(many[:, some], few, rtol=0, atol=tolerance)
 
@@ -375,7 +425,8 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
     H = space.transfer(0.25, float(cycle.period))[
         0, space.order - 1 : space.order + 2, 0, 0
     ]
-    exact = cycle.htf(0.25, (-1, 0, 1), "x").H[:, 0, 0, 0]
+    htf = cycle.htf(0.25, (-1, 0, 1), "x")
+    exact = htf.H[:, 0, 0, 0]
     assert_allclose(H, exact, rtol=1e-11)
     assert space.error < 1e-12
     assert space.order == 8
@@ -388,21 +439,31 @@ def test_harmonic_state_spaces_converge_to_the_exact_htf():
 
 def test_the_continuous_htf_of_a_speed_that_jumps_is_that_of_the_derivative_of_the_height():
     """With the impulses of the speed at impacts whose time moves."""
-    cycle = hj.find_limit_cycle(Juggler(), hj.Guess("fall", (0.2, 4.5), time=0.1))
+    guess = hj.Guess("fall", (0.2, 4.5), time=0.1)
+    cycle = hj.find_limit_cycle(Juggler(), guess)
     f = np.array([0.3, 1.7])
     m = np.arange(-3, 4)
-    y, v = np.moveaxis(cycle.htf(f, m, ("y", "v")).H[..., 0], -1, 0)
-    assert_allclose(v, 2j * np.pi * (f + m[:, None]) * y, rtol=1e-9)
+    H = cycle.htf(f, m, ("y", "v")).H
+    outputs = H[..., 0]
+    y, v = np.moveaxis(outputs, -1, 0)
+    rates = 2j * np.pi * (f + m[:, None])
+    assert_allclose(v, rates * y, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_path):
     rng = np.random.default_rng(0)
-    system = Neuron(current=1.0, leak=0.0, square=1.0, low=-2.0)
+    system = Neuron(
+        current=1.0,
+        leak=0.0,
+        square=1.0,
+        low=-2.0,
+    )
     f, angle = rng.uniform(0.1, 0.9, (2, 12))
 
     def current(t):
-        return 0.05 * jnp.sum(jnp.cos(2 * jnp.pi * (f * t + angle)), keepdims=True)
+        phase = 2 * jnp.pi * (f * t + angle)
+        return 0.05 * jnp.sum(jnp.cos(phase), keepdims=True)
 
     way = hj.simulate(system, "membrane", (-2.0,), 600.0, input=current)
     t = np.arange(0, 600, 0.02)
@@ -416,7 +477,8 @@ def test_the_curve_of_a_simulated_neuron_lies_in_the_band_of_its_estimate(tmp_pa
     curve = hj.find_limit_cycle(system).responses().curve()
     (low, high) = measured.interval(curve.phase)
     values = curve.values
-    assert np.mean(((low <= values) & (values <= high))[np.isfinite(values)]) > 0.9
+    is_inside = (low <= values) & (values <= high)
+    assert np.mean(is_inside[np.isfinite(values)]) > 0.9
     hj.plot.phase_response(measured, model=curve).save(tmp_path / "both")
 
 
@@ -456,9 +518,12 @@ def test_sensitivities_are_differences_of_cycles(system, name):
     def central(h):
         return (numbers(h) - numbers(-h)) / (2 * h)
 
-    difference = (4 * central(step / 2) - central(step)) / 3
+    half_step = central(step / 2)
+    difference = (4 * half_step - central(step)) / 3
     name = cycle.structure.charts[0].states[0]
-    begin = float(cycle.anchor.t[0]) / float(cycle.period) * change.period
+    period = float(cycle.period)
+    part = float(cycle.anchor.t[0]) / period
+    begin = part * change.period
     exact = [
         [change.period],
         np.array(change.times) - begin,
@@ -488,23 +553,39 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
         )
         responses = cycle.responses(modes=2 * guess.clocked)
         at = jnp.array([0.3])
-        push = responses.amplitude(0, at) if guess.clocked else responses.phase(at)
-        htf = cycle.htf(0.3, 1, output).H[0, 0, 0, 0]
+        if guess.clocked:
+            push = responses.amplitude(0, at)
+        else:
+            push = responses.phase(at)
+        H = cycle.htf(0.3, 1, output).H
+        htf = H[0, 0, 0, 0]
         noise = cycle.fluctuations({output: 0.1})
-        noisy = noise.covariance(at)[0, 0, 0] if guess.clocked else noise.diffusion
+        if guess.clocked:
+            noisy = noise.covariance(at)[0, 0, 0]
+        else:
+            noisy = noise.diffusion
         change = cycle.sensitivity(name)
-        shape = change.shape(at)[output][0] if guess.clocked else change.period
-        impulse = responses.impulses(0 if guess.clocked else None)[0].weight["u"]
+        if guess.clocked:
+            shape = change.shape(at)[output][0]
+        else:
+            shape = change.period
+        section = 0 if guess.clocked else None
+        impulse = responses.impulses(section)[0].weight["u"]
         later = change.durations[0]
-        return jnp.abs(jnp.stack([push[output][0], htf, noisy, shape, impulse, later]))
+        pushed = push[output][0]
+        values = [pushed, htf, noisy, shape, impulse, later]
+        return jnp.abs(jnp.stack(values))
 
-    forward = jax.jvp(result, (begin,), (jnp.ones(()),))[1]
+    _, forward = jax.jvp(result, (begin,), (jnp.ones(()),))
 
     def central(h):
-        return (result(begin + h) - result(begin - h)) / (2 * h)
+        later = result(begin + h)
+        change = later - result(begin - h)
+        return change / (2 * h)
 
     h = 1e-3 * begin
-    difference = (4 * central(h / 2) - central(h)) / 3
+    of_half_step = central(h / 2)
+    difference = (4 * of_half_step - central(h)) / 3
     assert_allclose(forward, difference, rtol=1e-7, atol=1e-12)
     assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
 

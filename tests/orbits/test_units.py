@@ -32,7 +32,8 @@ def dimensions(length, time):
 
 
 def hopper_cycle_in(length, time):
-    guess = hj.Guess("stance", (2.0 * length, 1.9 * length / time), 0.5 * time)
+    state = (2.0 * length, 1.9 * length / time)
+    guess = hj.Guess("stance", state, 0.5 * time)
     return hj.find_limit_cycle(hopper_in(length, time), guess)
 
 
@@ -42,12 +43,16 @@ def relaxation_in(length, time):
 
     def field(t, q, u):
         x, v, nothing, rounding = q
-        force = (1 - (x / length) ** 2) * v / time - x / time**2
-        still = (((x + length) - x) - length - rounding) / time
+        damping = (1 - (x / length) ** 2) * v / time
+        force = damping - x / time**2
+        rounded = (x + length) - x
+        still = (rounded - length - rounding) / time
         return v, force + u[0], -nothing / time, still
 
-    system = toy({"all": Field(("x", "v", "nothing", "rounding"), field)})
-    return hj.find_limit_cycle(system, hj.Guess("all", (2.0 * length, 0.0, 0.0, 0.0)))
+    chart = Field(("x", "v", "nothing", "rounding"), field)
+    system = toy({"all": chart})
+    guess = hj.Guess("all", (2.0 * length, 0.0, 0.0, 0.0))
+    return hj.find_limit_cycle(system, guess)
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +83,10 @@ def test_cycle_linearization_and_transfer_functions_of_the_hopper(hopper_cycle, 
     found = other.htf(FREQUENCIES, (-1, 0, 1)).H
     for k, name in enumerate(model.outputs):
         unit = sizes[name[0]] / sizes["force"]
-        tolerance = 1e-9 * np.abs(expected[:, :, k]).max()
-        assert_allclose(found[:, :, k] / unit, expected[:, :, k], atol=tolerance)
+        largest = np.abs(expected[:, :, k]).max()
+        tolerance = 1e-9 * largest
+        in_units = found[:, :, k] / unit
+        assert_allclose(in_units, expected[:, :, k], atol=tolerance)
 
 
 @pytest.mark.slow
@@ -90,7 +97,8 @@ def test_an_oscillator_without_a_clock(relaxation, unit):
     cycle = relaxation_in(length, time)
     assert cycle.result == hj.errors.Result.OK
     assert_allclose(cycle.period / time, relaxation.period, rtol=1e-9)
-    assert_allclose(cycle.multipliers[:2], relaxation.multipliers[:2], rtol=1e-9)
+    leading = cycle.multipliers[:2]
+    assert_allclose(leading, relaxation.multipliers[:2], rtol=1e-9)
 
 
 def test_states_that_rest_stop_nothing(relaxation):
@@ -107,12 +115,14 @@ def test_a_state_that_rounding_moves_by_time_stops_nothing():
     amplitude = 1 / (4 - 9 + 3j)
     """Beside a damped oscillator under a clock."""
     for time in (0.0, 0.3):
-        cycle = hj.find_limit_cycle(RESTING, hj.Guess("all", (0.0, 0.0, 0.0), time))
+        guess = hj.Guess("all", (0.0, 0.0, 0.0), time)
+        cycle = hj.find_limit_cycle(RESTING, guess)
         assert cycle.scale["w"] > 1e-7
         x = (amplitude * np.exp(3j * time)).real
         assert_allclose(cycle.state["x"], x, rtol=1e-9)
         decay = np.sort(np.abs(cycle.multipliers))
-        truth = np.exp(-np.array([1.0, 0.5, 0.5]) * 2 * np.pi / 3)
+        rates = np.array([1.0, 0.5, 0.5])
+        truth = np.exp(-rates * 2 * np.pi / 3)
         assert_allclose(decay, truth, rtol=1e-9)
 
 

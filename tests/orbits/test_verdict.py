@@ -24,7 +24,8 @@ class Charging(hj.Chart):
     states = ("x",)
 
     def field(self, t, q, u):
-        return ((self.output - q[0] + u[0]) / self.circuit.tau,)
+        rise = self.output - q[0] + u[0]
+        return (rise / self.circuit.tau,)
 
 
 class SchmittTrigger(hj.HybridSystem):
@@ -35,7 +36,8 @@ class SchmittTrigger(hj.HybridSystem):
     ripple: hj.Parameter = hj.parameter(0.1)
 
     def threshold(self, t):
-        return self.width + self.ripple * jnp.sin(2 * jnp.pi * t)
+        wave = jnp.sin(2 * jnp.pi * t)
+        return self.width + self.ripple * wave
 
     def charts(self):
         return {"up": Charging(self, 1.0), "down": Charging(self, -1.0)}
@@ -102,7 +104,8 @@ def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
     while len(times) < count:
         wait = np.log((drive - v) / (drive - 1.0))
         k = int(np.argmin(wait))
-        v = drive + (v - drive) * np.exp(-wait[k])
+        decay = np.exp(-wait[k])
+        v = drive + (v - drive) * decay
         t += wait[k]
         v[1 - k] -= inhibition
         v[k] = 0.0
@@ -114,7 +117,8 @@ def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
 def test_a_guess_on_the_right_side_of_the_guards_finds_the_rhythm():
     # From between the thresholds Newton's method goes to the rest point beyond one of them.
     for chart, x in (("up", 0.0), ("down", 0.0), ("up", -0.9), ("down", 0.9)):
-        cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess(chart, (x,)))
+        guess = hj.Guess(chart, (x,))
+        cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
         assert sorted(cycle.event_sequence) == [0, 1]
         assert 0.69 < cycle.multipliers[0].real < 0.70
         assert not cycle.findings
@@ -146,13 +150,16 @@ def test_the_rhythm_of_two_cells_is_that_of_the_closed_form():
 def ghost_beside(cycle):
     """The cycle as if it rested at x = 1, beyond the threshold."""
     found = cycle.anchor
-    anchor = found._replace(chart=jnp.zeros_like(found.chart), q=jnp.ones_like(found.q))
+    chart = jnp.zeros_like(found.chart)
+    ones = jnp.ones_like(found.q)
+    anchor = found._replace(chart=chart, q=ones)
     return dataclasses.replace(cycle, anchor=anchor)
 
 
 @pytest.mark.slow
 def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
-    cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    guess = hj.Guess("up", (0.0,))
+    cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
     ghost = ghost_beside(cycle)
     widths = jnp.linspace(0.297, 0.303, 4)
     systems = eqx.filter_vmap(lambda w: SchmittTrigger(width=w))(widths)
@@ -175,7 +182,8 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
 
 
 def test_a_branch_does_not_begin_beyond_a_guard():
-    cycle = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    guess = hj.Guess("up", (0.0,))
+    cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
     with pytest.raises(hj.errors.DefinitionError, match="none of SchmittTrigger"):
         hj.continuation(ghost_beside(cycle), "width", (0.25, 0.35))
 
@@ -218,15 +226,21 @@ class Switched(hj.HybridSystem):
 
 
 def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard():
-    cycle = hj.find_limit_cycle(Switched(), hj.Guess("up", (0.0,), time=0.0))
+    guess = hj.Guess("up", (0.0,), time=0.0)
+    cycle = hj.find_limit_cycle(Switched(), guess)
     half = np.exp(-0.5)
-    at_switch = 1 - (1 - cycle.anchor.q[0, 0]) * np.exp(-0.25)
-    assert at_switch == pytest.approx((1 - half) / (1 + half), abs=1e-12)
-    assert cycle.multipliers == pytest.approx([np.exp(-1)], abs=1e-12)
+    since = np.exp(-0.25)
+    below = 1 - cycle.anchor.q[0, 0]
+    at_switch = 1 - below * since
+    exact = (1 - half) / (1 + half)
+    assert at_switch == pytest.approx(exact, abs=1e-12)
+    expected_multipliers = [np.exp(-1)]
+    assert cycle.multipliers == pytest.approx(expected_multipliers, abs=1e-12)
 
 
 def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():
-    good = hj.find_limit_cycle(SchmittTrigger(), hj.Guess("up", (0.0,)))
+    guess = hj.Guess("up", (0.0,))
+    good = hj.find_limit_cycle(SchmittTrigger(), guess)
     cycles = hj.orbits.find_limit_cycles(
         [SchmittTrigger(width=w) for w in (0.3, 0.9)], good
     )
@@ -258,7 +272,8 @@ class Driven(hj.HybridSystem):
 def test_a_clock_that_is_too_long_is_a_doubt(turns):
     """The multiplier of two periods is the square of that of one: the print says so."""
     cycle = hj.find_limit_cycle(Driven(turns))
-    assert cycle.multipliers[0] == pytest.approx(np.exp(-0.2 * np.pi * turns), rel=1e-8)
+    expected = np.exp(-0.2 * np.pi * turns)
+    assert cycle.multipliers[0] == pytest.approx(expected, rel=1e-8)
     causes = [finding.cause for finding in cycle.findings]
     assert ("a long clock" in causes) == (turns > 1)
     assert ("shortest period" in repr(cycle)) == (turns == 1)

@@ -32,16 +32,22 @@ class Hopper:
     @staticmethod
     def leg(t, yM, ym):
         """The force of the leg."""
-        return 10 * (2 - (yM - ym)) + 20 * math.sin(2 * math.pi * t)
+        spring = 10 * (2 - (yM - ym))
+        motor = 20 * math.sin(2 * math.pi * t)
+        return spring + motor
 
     def stance(self, t, q, u):
         yM, vM = q
-        return vM, (self.leg(t, yM, 0.0) + u) / 2 - 2
+        force = self.leg(t, yM, 0.0) + u
+        acceleration = force / 2 - 2
+        return vM, acceleration
 
     def flight(self, t, q, u):
         yM, vM, ym, vm = q
         leg = self.leg(t, yM, ym)
-        return vM, (leg + u) / 2 - 2, vm, -leg - 5 * vm - 2
+        body = (leg + u) / 2 - 2
+        foot = -leg - 5 * vm - 2
+        return vM, body, vm, foot
 
     def reset(self, seed):
         self.set_state((0.0, 2.2, -0.5, 0.3, -0.5))
@@ -51,7 +57,9 @@ class Hopper:
         return {"yM": self.q[0], "vM": self.q[1]}
 
     def get_state(self):
-        foot = self.q[2:] if self.flies(self.q) else (0.0, 0.0)
+        foot = (0.0, 0.0)
+        if self.flies(self.q):
+            foot = self.q[2:]
         return (self.t, *self.q[:2], *foot)
 
     def set_state(self, x):
@@ -85,17 +93,22 @@ class Hopper:
         while end - self.t > 1e-15:
             left = end - self.t
             q = self.flow(left, u[0])
-            has_event = self.guard(self.t, self.q) > 0 > self.guard(end, q)
+            before = self.guard(self.t, self.q)
+            has_event = before > 0 > self.guard(end, q)
             if not has_event:
                 self.t = end
                 self.q = q
                 break
 
             def guard_after(h):
-                return self.guard(self.t + h, self.flow(h, u[0]))
+                q = self.flow(h, u[0])
+                return self.guard(self.t + h, q)
 
             until_event = brentq(guard_after, 1e-15, left, xtol=1e-15)
             q = self.flow(until_event, u[0])
             self.t = self.t + until_event
-            self.q = q[:2] if self.flies(q) else [*q, 0.0, 0.0]
+            if self.flies(q):
+                self.q = q[:2]
+            else:
+                self.q = [*q, 0.0, 0.0]
         return self.observe()

@@ -34,7 +34,8 @@ SECTIONS = hj.KinematicPhase(8, "x", "v")
 
 
 def drive(model, data):
-    return [20 * math.sin(2 * math.pi * data.time), 0.0]
+    motor = 20 * math.sin(2 * math.pi * data.time)
+    return [motor, 0.0]
 
 
 class Environment(gymnasium.Env):
@@ -45,11 +46,14 @@ class Environment(gymnasium.Env):
 
     def reset(self, seed=None, options=None):
         self.circle = Circle()
-        return np.array([*self.circle.reset(seed).values()]), {}
+        state = self.circle.reset(seed).values()
+        return np.array([*state]), {}
 
     def step(self, action):
-        z = np.array([*self.circle.step(action, 0.02).values()])
-        return z, 0.0, bool(np.hypot(*z) > 1.5), False, {}
+        state = self.circle.step(action, 0.02).values()
+        z = np.array([*state])
+        has_fallen = bool(np.hypot(*z) > 1.5)
+        return z, 0.0, has_fallen, False, {}
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +83,8 @@ def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     assert (
         abs(cycle.period - exact.period) < 0.2 * plant.dt**2
     )  # (linear interpolation)
-    u = 0.05 * np.random.default_rng(0).standard_normal((2, 80, 1))
+    rng = np.random.default_rng(0)
+    u = 0.05 * rng.standard_normal((2, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     again = cycle.run_experiments(u, discard=0, processes=1)
     assert np.array_equal(data.y, again.y)
@@ -104,7 +109,8 @@ def test_sections_are_interpolated_between_fixed_steps(gymnasium_circle):
     u = 0.05 * rng.standard_normal((1, 80, 1))
     data = cycle.run_experiments(u, discard=0, processes=0)
     assert data.ok.all()
-    assert 0.01 < data.simulated.late.max() <= 0.02 * (1 + 1e-9)
+    latest = data.simulated.late.max()
+    assert 0.01 < latest <= 0.02 * (1 + 1e-9)
     exact_cycle = hj.plants.find_cycle(Circle(), sections, "x", cycles=10)
     exact = exact_cycle.run_experiments(u, discard=0, processes=0)
     tolerance = 0.05 * np.abs(exact.y).max()
@@ -132,16 +138,19 @@ def test_mujoco_continues_from_its_state(ground):
     """On soft ground the paper's hopper settles near its cycle on hard ground."""
     hard = hj.find_limit_cycle(hj.models.VerticalHopper())
     at = hj.sections.place_sections(hard, hj.ClockPhase(10, anchor=0.7))
-    error = np.abs(ground.cycle_outputs - np.asarray(at.observe(("yM", "vM")))).max()
+    observed = np.asarray(at.observe(("yM", "vM")))
+    error = np.abs(ground.cycle_outputs - observed).max()
     assert error < 0.05
     plant = ground.plant
     start = ground.drive.start
     courses = []
     for _ in range(2):
         plant.set_state(start.state)
-        courses.append([plant.step([0.1], h) for h in (0.02, 0.0123, 0.5)])
+        durations = (0.02, 0.0123, 0.5)
+        courses.append([plant.step([0.1], h) for h in durations])
     assert courses[0] == courses[1]
-    assert courses[0][-1].keys() == {"yM", "ym", "yM_rate", "ym_rate"}
+    last = courses[0][-1]
+    assert last.keys() == {"yM", "ym", "yM_rate", "ym_rate"}
 
 
 def test_a_controller_may_keep_memory_in_userdata():
@@ -200,9 +209,15 @@ def test_a_walker_in_mujoco():
     """Perturbed returns at clock sections and at the touchdown agree with experiments."""
     plant = walker()
     outputs = ("x_rate", "pitch")
-    cycle = hj.plants.find_cycle(plant, hj.ClockPhase(8), outputs, cycles=40)
+    sections = hj.ClockPhase(8)
+    cycle = hj.plants.find_cycle(plant, sections, outputs, cycles=40)
     returns = cycle.perturbed_returns(coordinates(plant))
-    design = hj.multisine(n_sections=8, periods=16, amplitude=0.1, lines="odd")
+    design = hj.multisine(
+        n_sections=8,
+        periods=16,
+        amplitude=0.1,
+        lines="odd",
+    )
     data = cycle.run_experiments(design, discard=24)
     fit = hj.fit_multipliers(hj.estimate_htf(data), order=2)
     assert fit.contains(returns.multipliers[:2]).all()
@@ -213,7 +228,8 @@ def test_a_walker_in_mujoco():
     at_touchdown = hj.plants.find_cycle(plant, touchdown, outputs, cycles=40)
     with_time = [*coordinates(plant), "time"]
     there = at_touchdown.perturbed_returns(with_time).multipliers
-    error = np.abs(there[:2] - returns.multipliers[:2])
+    difference = there[:2] - returns.multipliers[:2]
+    error = np.abs(difference)
     assert error.max() < 2e-3
 
     push = np.zeros((44, 1))
@@ -228,11 +244,13 @@ def test_mujoco_returns_and_htfs_agree(ground):
     """Two multipliers are those of hard ground; soft ground adds a third one, near 0.007."""
     returns = ground.perturbed_returns()
     hard = hj.find_limit_cycle(hj.models.VerticalHopper()).multipliers
-    error = np.abs(returns.multipliers[:2] - hard).max()
+    leading = returns.multipliers[:2]
+    error = np.abs(leading - hard).max()
     assert error < 0.01
     assert 0.002 < returns.multipliers[2].real < 0.02
     assert len(returns.multipliers) == 3
     design = hj.multisine(n_sections=10, periods=16, amplitude=0.02)
-    fit = hj.fit_multipliers(hj.estimate_htf(ground.run_experiments(design)), order=2)
+    measured = hj.estimate_htf(ground.run_experiments(design))
+    fit = hj.fit_multipliers(measured, order=2)
     assert fit.contains(returns.multipliers[:2]).all()
     assert returns.contains(fit.multipliers).all()

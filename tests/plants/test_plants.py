@@ -34,7 +34,9 @@ MULTIPLIER = math.exp(-0.4 * math.pi)  # of the circle's radius
 def test_a_plant_in_closed_form(circle):
     assert_allclose(circle.period, 2 * math.pi, rtol=0, atol=1e-9)
     angle = 2 * math.pi * np.arange(8) / 8
-    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    x = np.cos(angle)
+    y = np.sin(angle)
+    directions = np.stack([x, y], axis=1)
     assert_allclose(circle.cycle_outputs, directions, rtol=0, atol=1e-9)
 
 
@@ -58,9 +60,12 @@ def test_a_push_moves_a_plant_as_its_closed_form(circle):
     after = data.y[0, 4:]
     assert_allclose(before, 0, rtol=0, atol=1e-8)
     angle = 2 * math.pi * np.arange(4, 16) / 8
-    radius = after[:, 0] * np.cos(angle) + after[:, 1] * np.sin(angle)
+    x = after[:, 0]
+    y = after[:, 1]
+    radius = x * np.cos(angle) + y * np.sin(angle)
     decay = math.exp(-rate * math.tau / 8)
-    expected = push / rate * (1 - decay) * decay ** np.arange(12)
+    start = push / rate * (1 - decay)
+    expected = start * decay ** np.arange(12)
     assert_allclose(radius, expected, rtol=0, atol=1e-8)
     assert data.outputs[0].unit == "m"
     assert data.inputs[0].unit == "m/s"
@@ -73,7 +78,8 @@ def test_sections_at_events():
     falling = hj.Crossing("y", "falling", level)
     cycle = hj.plants.find_cycle(Circle(), [rising, falling], ("x", "y"), cycles=20)
     assert_allclose(cycle.period, math.tau, rtol=0, atol=1e-9)
-    places = [[math.cos(0.2), level], [-math.cos(0.2), level]]
+    right = math.cos(0.2)
+    places = [[right, level], [-right, level]]
     assert_allclose(cycle.cycle_outputs, places, rtol=0, atol=1e-8)
     returns = cycle.perturbed_returns()
     assert_allclose(returns.multipliers, [MULTIPLIER], rtol=0, atol=1e-6)
@@ -81,17 +87,21 @@ def test_sections_at_events():
 
 def test_a_motion_is_recorded_up_to_a_fall(circle):
     def picture(z):
-        return hj.systems.Drawing(circles={"point": (z["x"], z["y"], 0.1)})
+        point = (z["x"], z["y"], 0.1)
+        return hj.systems.Drawing(circles={"point": point})
 
     motion = circle.trajectory(picture)
     t, x = motion("x")
     error = abs(motion.t[-1] - 2 * math.pi)
     assert error < 1e-8
-    error = np.abs(x - np.cos(t)).max()
+    expected_cosine = np.cos(t)
+    error = np.abs(x - expected_cosine).max()
     assert error < 1e-3
-    error = np.abs(motion.after[:, 0] - np.cos(motion.t)).max()
+    expected_x = np.cos(motion.t)
+    error = np.abs(motion.after[:, 0] - expected_x).max()
     assert error < 1e-9
-    assert len(hj.plot.animate(motion, "x", "y").times) > 4
+    film = hj.plot.animate(motion, "x", "y")
+    assert len(film.times) > 4
 
     class Falls(Circle):
         def step(self, u, duration):
@@ -104,7 +114,8 @@ def test_a_motion_is_recorded_up_to_a_fall(circle):
             return super().step(u, duration)
 
     cycle = hj.plants.find_cycle(Falls(), ANGLE, "x", cycles=20)
-    fall = cycle.trajectory(picture, [[0.0], [0.0], [2.0], [0.0]])
+    pushes = [[0.0], [0.0], [2.0], [0.0]]
+    fall = cycle.trajectory(picture, pushes)
     assert fall.result == hj.errors.Result.PLANT_STOPPED
     error = abs(fall.t[-1] - math.pi / 2)
     assert error < 1e-8
@@ -125,7 +136,8 @@ class Travelling(Circle):
         return (*self.q, self.distance)
 
     def set_state(self, q):
-        self.distance = float(q[2]) if len(q) > 2 else self.distance
+        if len(q) > 2:
+            self.distance = float(q[2])
         return super().set_state(q[:2]) | {"distance": self.distance}
 
     def step(self, u, duration):
@@ -194,10 +206,13 @@ def test_errors_contain_the_stairs_of_time_steps():
         b = rng.uniform(0.3, 0.5)
         c = rng.uniform(0.25, 0.4)
         d = rng.uniform(0.3, 0.5)
-        plant = Stairs(a, b, c, d, float(1 / rng.integers(100, 300)))
-        cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+        time_step = float(1 / rng.integers(100, 300))
+        plant = Stairs(a, b, c, d, time_step)
+        sections = hj.ClockPhase(2)
+        cycle = hj.plants.find_cycle(plant, sections, "v", cycles=40)
         returns = cycle.perturbed_returns("v")
-        held.append(bool(returns.contains(a + b * d).all()))
+        true = a + b * d
+        held.append(bool(returns.contains(true).all()))
         flat.append(bool(returns.contains(a).all()))
     # (Fewer than 17 once in 70 times, if the regions are right.)
     assert sum(held) >= 17
@@ -225,13 +240,16 @@ def test_errors_contain_stairs_of_steps_that_a_plant_divides():
         b = rng.uniform(0.3, 0.5)
         c = rng.uniform(0.25, 0.4)
         d = rng.uniform(0.3, 0.5)
-        plant = FineStairs(a, b, c, d, float(1 / rng.integers(20, 60)))
-        cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
+        time_step = float(1 / rng.integers(20, 60))
+        plant = FineStairs(a, b, c, d, time_step)
+        sections = hj.ClockPhase(2)
+        cycle = hj.plants.find_cycle(plant, sections, "v", cycles=40)
         returns = cycle.perturbed_returns("v")
         off = returns.multipliers[0] - (a + b * d)
         ratios.append(abs(off) / returns.standard_errors[0])
     # (The rms of 16 numbers of Student's distribution with 21 degrees of freedom.)
-    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.5
+    rms = np.sqrt(np.mean(np.square(ratios)))
+    assert 0.5 < rms < 1.5
 
 
 class Rounded(Circle):
@@ -247,12 +265,14 @@ class Rounded(Circle):
         return (*self.q, self.side)
 
     def set_state(self, q):
-        self.side = float(q[2]) if len(q) > 2 else self.side
+        if len(q) > 2:
+            self.side = float(q[2])
         return super().set_state(q[:2]) | {"side": self.side}
 
     def step(self, u, duration):
         rounding = 4e-16 * math.sin(1e4 * self.q[0])
-        self.side = (1.0 + self.side * math.exp(-0.1 * duration) + rounding) - 1.0
+        decay = math.exp(-0.1 * duration)
+        self.side = (1.0 + self.side * decay + rounding) - 1.0
         return super().step(u, duration)
 
 
@@ -268,8 +288,10 @@ def test_a_coordinate_of_rounding_errors_is_at_rest():
 @pytest.mark.parametrize(("size", "cause"), [(1e-6, "stairs"), (0.1, None)])
 def test_inputs_that_stay_on_one_stair_are_named(size, cause):
     plant = Stairs(0.4, 0.4, 0.3, 0.4, 0.005)
-    cycle = hj.plants.find_cycle(plant, hj.ClockPhase(2), "v", cycles=40)
-    u = size * np.random.default_rng(0).normal(size=(4, 60, 1))
+    sections = hj.ClockPhase(2)
+    cycle = hj.plants.find_cycle(plant, sections, "v", cycles=40)
+    rng = np.random.default_rng(0)
+    u = size * rng.normal(size=(4, 60, 1))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         data = cycle.run_experiments(u, processes=0)
@@ -283,10 +305,12 @@ def test_inputs_beyond_the_linear_range_are_named():
 
     class Curved(Circle):
         def step(self, u, duration):
-            return super().step([u[0] + 0.1 * u[0] ** 2], duration)
+            square = 0.1 * u[0] ** 2
+            return super().step([u[0] + square], duration)
 
     cycle = hj.plants.find_cycle(Curved(), ANGLE, "x", cycles=20)
-    u = np.random.default_rng(0).normal(size=(4, 32, 1))
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(4, 32, 1))
     small = cycle.run_experiments(1e-3 * u, discard=0, processes=0)
     assert not small.findings
     with pytest.warns(hj.errors.FindingWarning, match="not linear"):
@@ -305,7 +329,8 @@ def test_an_unstable_cycle_is_found_from_a_guess():
     error = abs(cycle.cycle_outputs[0, 0] - 1)
     assert error < 1e-8
     returns = cycle.perturbed_returns()
-    assert returns.contains(math.exp(0.4 * math.pi)).all()
+    multiplier = math.exp(0.4 * math.pi)
+    assert returns.contains(multiplier).all()
     assert len(returns.multipliers) == 1
 
 
@@ -314,7 +339,8 @@ def test_failures_are_named_and_the_others_go_on():
     data = cycle.run_experiments(
         np.zeros((9, 24, 1)), discard=0, processes=2, limit=15.0
     )
-    assert data.ok.tolist() == [True] + 7 * [False] + [True]
+    expected_ok = [True] + 7 * [False] + [True]
+    assert data.ok.tolist() == expected_ok
     causes = data.simulated.causes
     expected = (
         "",
@@ -327,16 +353,20 @@ def test_failures_are_named_and_the_others_go_on():
         "was not reached within",
         "",
     )
-    assert [x in cause for x, cause in zip(expected, causes, strict=True)] == [True] * 9
-    assert (data.result[1:8] == 7 * [hj.errors.Result.PLANT_STOPPED]).all()
+    named = [x in cause for x, cause in zip(expected, causes, strict=True)]
+    assert named == [True] * 9
+    stopped = 7 * [hj.errors.Result.PLANT_STOPPED]
+    assert (data.result[1:8] == stopped).all()
     assert np.isfinite(data.y[[0, 8]]).all()
-    assert np.isnan(data.y[1, data.failed_at[1] :]).all()
+    later = data.y[1, data.failed_at[1] :]
+    assert np.isnan(later).all()
     assert "#1: section" in data.summary(9)
     assert "the hip broke" in data.summary(9)
 
 
 def test_a_store_continues(circle, tmp_path, monkeypatch):
-    u = 0.01 * np.random.default_rng(0).standard_normal((10, 16, 1))
+    rng = np.random.default_rng(0)
+    u = 0.01 * rng.standard_normal((10, 16, 1))
     whole = circle.run_experiments(u, discard=0, processes=0)
     experiment = type(circle.drive)
     seeds = []
@@ -354,16 +384,20 @@ def test_a_store_continues(circle, tmp_path, monkeypatch):
         circle.run_experiments(u, **options)
     data = circle.run_experiments(u, **options)
     # (The last two have half of the first input and none, which test the size of the inputs.)
-    assert seeds == [*range(1, 10), 9, 10, 1, 1]
+    expected = [*range(1, 10), 9, 10, 1, 1]
+    assert seeds == expected
     assert np.array_equal(data.y, whole.y)
     assert data.simulated.causes == 10 * ("",)
     assert not np.array_equal(
         circle.run_experiments(2 * u[:1], **options).y, data.y[:1]
     )
     monkeypatch.setattr(circle.drive.plant, "rate", 0.4)  # around the same cycle
-    assert np.abs(circle.run_experiments(u, **options).y - data.y).max() > 1e-3
+    other = circle.run_experiments(u, **options)
+    apart = np.abs(other.y - data.y)
+    assert apart.max() > 1e-3
     hj.save(tmp_path / "data.npz", data)
-    assert np.array_equal(hj.load(tmp_path / "data.npz").y, data.y)
+    stored = hj.load(tmp_path / "data.npz")
+    assert np.array_equal(stored.y, data.y)
 
 
 def test_what_does_not_fit_is_refused(circle):
@@ -390,7 +424,8 @@ def test_what_does_not_fit_is_refused(circle):
 
     class Forgetful(Circle):
         def step(self, u, duration):  # (`get_state` lacks the number of steps)
-            return super().step([0.05 * math.sin(0.03 * self.steps)], duration)
+            wind = 0.05 * math.sin(0.03 * self.steps)
+            return super().step([wind], duration)
 
     with pytest.raises(hj.errors.DefinitionError, match="does not continue as before"):
         hj.plants.find_cycle(Forgetful(), ANGLE, "x", cycles=20)
@@ -414,7 +449,8 @@ def test_a_lasting_push_leads_to_another_cycle():
     push = np.full((1, 8, 1), 0.01)
     data = cycle.run_experiments(push, discard=0, processes=0)
     assert data.ok.all()
-    x = math.sqrt(1 - level**2) + data.y[0, :, 0]
+    on_circle = math.sqrt(1 - level**2)
+    x = on_circle + data.y[0, :, 0]
     radius = np.hypot(x, level)
     expected = 1.05 - 0.05 * MULTIPLIER ** np.arange(8)
     assert_allclose(radius, expected, rtol=0, atol=2e-3)

@@ -30,10 +30,14 @@ class Circle:
     def step(self, u, duration):
         self.steps += 1
         r = math.hypot(*self.q)
-        angle = math.atan2(self.q[1], self.q[0]) + duration
+        begin = math.atan2(self.q[1], self.q[0])
+        angle = begin + duration
         rest = 1 + u[0] / self.rate
-        r = rest + (r - rest) * math.exp(-self.rate * duration)
-        return self.set_state((r * math.cos(angle), r * math.sin(angle)))
+        decay = math.exp(-self.rate * duration)
+        r = rest + (r - rest) * decay
+        x = r * math.cos(angle)
+        y = r * math.sin(angle)
+        return self.set_state((x, y))
 
 
 class Troubled(Circle):

@@ -23,8 +23,12 @@ def control(model, data):
     swings = 0.5 + 0.5 * math.tanh(4 * phase)  # 1: left, 0: right
     ahead = speed * PERIOD / 4 + 0.3 * (speed - 0.4)
     torso = -150 * pitch - 20 * rate
-    swing_left = 60 * (ahead - pitch - left) - 7.5 * (rate + left_rate)
-    swing_right = 60 * (ahead - pitch - right) - 7.5 * (rate + right_rate)
+    pull_left = 60 * (ahead - pitch - left)
+    brake_left = 7.5 * (rate + left_rate)
+    swing_left = pull_left - brake_left
+    pull_right = 60 * (ahead - pitch - right)
+    brake_right = 7.5 * (rate + right_rate)
+    swing_right = pull_right - brake_right
     return [
         swings * swing_left - (1 - swings) * (torso + swing_right),
         (1 - swings) * swing_right - swings * (torso + swing_left),

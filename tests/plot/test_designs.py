@@ -7,7 +7,9 @@ from numpy.testing import assert_allclose
 import hybridjax as hj
 
 
-MODEL = hj.linear.LDTP(np.full((4, 1, 1), 0.9), np.ones((4, 1, 1)), np.ones((4, 1, 1)))
+ONES = np.ones((4, 1, 1))
+DECAY = np.full((4, 1, 1), 0.9)
+MODEL = hj.linear.LDTP(DECAY, ONES, ONES)
 USUAL = hj.multisine(4, 16, frequencies=(0, 2.0))
 GOAL = hj.designs.MultiplierGoal(harmonics=0)
 ASKED = dict(noise={"y": 1e-3}, goal=GOAL)
@@ -19,17 +21,21 @@ def plan():
 
 
 def test_the_spectrum_of_a_design(plan):
-    above, below = hj.plot.spectrum(plan, MODEL).axes[:, 0]
+    axes = hj.plot.spectrum(plan, MODEL).axes
+    above, below = axes[:, 0]
     f = np.unique(plan.frequencies)
     htf = MODEL.htf(f, 0)
-    modulus = np.abs(np.asarray(htf.H)[0, :, 0, 0])
+    response = np.asarray(htf.H)
+    H = response[0, :, 0, 0]
+    modulus = np.abs(H)
     (drawn,) = above.get_lines()
     assert_allclose(drawn.get_ydata(), modulus / modulus.max())
 
     usual, optimal = below.get_lines()
     power = np.square(optimal.get_ydata()) / 2
     assert_allclose(power.sum(), plan.power.sum())
-    assert_allclose(usual.get_ydata(), np.sqrt(2 * plan.usual_power))
+    amplitude = np.sqrt(2 * plan.usual_power)
+    assert_allclose(usual.get_ydata(), amplitude)
     assert below.get_ylabel() == "amplitude, rms\nover experiments"
     assert plan.usual_name == "equal amplitudes"
     legend = [text.get_text() for text in below.get_legend().get_texts()]
@@ -54,7 +60,8 @@ def test_what_strides_buy(plan):
 
     strides, errors = lines["equal amplitudes"].get_data()
     of_usual = np.log(USUAL.cycles(0))
-    log_error = np.interp(of_usual, np.log(strides), np.log(errors))
+    log_strides = np.log(strides)
+    log_error = np.interp(of_usual, log_strides, np.log(errors))
     expected = np.linalg.norm(plan.usual_standard_errors)
     assert np.exp(log_error) == pytest.approx(expected)
     with pytest.raises(hj.errors.DefinitionError, match="without a block"):

@@ -25,11 +25,13 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     assert explorer.message.startswith("The cycle is lost at slope = 0.0")
     found = float(explorer.cycle.system.slope)
     assert explorer.message.endswith(f"The picture is that at slope = {found:.4g}.")
-    assert {ax.get_facecolor() for ax in explorer.figure.axes} == {to_rgba("0.88")}
+    colors = {ax.get_facecolor() for ax in explorer.figure.axes}
+    assert colors == {to_rgba("0.88")}
     assert 0.001 < float(explorer.cycle.system.slope) <= 0.1
     explorer.move({"slope": 0.1})
     assert explorer.message == ""
-    assert {ax.get_facecolor() for ax in explorer.figure.axes} == {to_rgba("white")}
+    new_colors = {ax.get_facecolor() for ax in explorer.figure.axes}
+    assert new_colors == {to_rgba("white")}
     assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
 
 
@@ -52,13 +54,18 @@ def test_the_widget_sends_pictures():
     assert widget.answer["number"] == 1
     assert widget.answer["picture"] != before["picture"]
     # Only what moves is drawn anew, and the picture is that of the whole figure.
-    with io.BytesIO(base64.b64decode(widget.answer["picture"].split(",")[1])) as file:
-        sent = np.asarray(Image.open(file).convert("RGB")).astype(int)
+    encoded = widget.answer["picture"].split(",")[1]
+    with io.BytesIO(base64.b64decode(encoded)) as file:
+        pixels = np.asarray(Image.open(file).convert("RGB"))
+        sent = pixels.astype(int)
     canvas = FigureCanvasAgg(explorer.figure)
     for artist in explorer.figure.findobj():
         artist.set_animated(False)
     canvas.draw()
-    error = np.mean(np.abs(sent - np.asarray(canvas.buffer_rgba())[..., :3]) > 64)
+    canvas_pixels = np.asarray(canvas.buffer_rgba())
+    drawn = canvas_pixels[..., :3]
+    differs = np.abs(sent - drawn) > 64
+    error = np.mean(differs)
     assert error < 1e-3
 
 
@@ -81,7 +88,8 @@ def test_a_window_marks_the_picture_while_it_searches(monkeypatch):
     drawn = explorer.figure.canvas.draw
 
     def draw():
-        gray = explorer.figure.axes[0].get_facecolor() == to_rgba("0.88")
+        face = explorer.figure.axes[0].get_facecolor()
+        gray = face == to_rgba("0.88")
         seen.append((explorer.figure.get_suptitle(), gray))
         drawn()
 
@@ -136,6 +144,7 @@ setTimeout(() => {{
     budget = "--virtual-time-budget=1500"
     run = [browser, *options, profile, budget, "--dump-dom", page.as_uri()]
     shown = subprocess.run(run, capture_output=True, text=True, timeout=120).stdout
-    lines = shown.split('<pre id="log">')[1].split("</pre>")[0].splitlines()
+    log = shown.split('<pre id="log">')[1]
+    lines = log.split("</pre>")[0].splitlines()
     searching = "0.25: searching for the cycle; the picture is that before"
     assert lines == ["1: nothing", searching, "1: nothing"]

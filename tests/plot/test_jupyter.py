@@ -37,14 +37,16 @@ def images(cell):
 
 
 def test_every_figure_is_shown_once(outputs):
-    assert [len(images(cell)) for cell in outputs[:4]] == [0, 1, 1, 1]
+    counts = [len(images(cell)) for cell in outputs[:4]]
+    assert counts == [0, 1, 1, 1]
 
 
 def test_a_column_has_150_points_per_inch(outputs):
     head = base64.b64decode(images(outputs[1])[0])[
         16:20
     ]  # of a PNG: where its width is
-    assert struct.unpack(">I", head)[0] > 0.9 * 150 * COLUMN
+    width = struct.unpack(">I", head)[0]
+    assert width > 0.9 * 150 * COLUMN
 
 
 def test_what_a_long_call_says_is_gone_when_it_ends(outputs):

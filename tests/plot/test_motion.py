@@ -36,10 +36,12 @@ def test_feet_do_not_slide_and_the_loop_closes(walk):
     path = walk.trajectory()
     pictures = Pictures(path, period)
     strike = path.t[path.event >= 0][-1]
-    before, after = pictures.at(np.array([strike - 1e-9, strike]))
+    around = np.array([strike - 1e-9, strike])
+    before, after = pictures.at(around)
     for new, old in (("stance foot", "swing foot"), ("swing foot", "stance foot")):
         assert_allclose(after.points[new], before.points[old], atol=1e-7)
-    times = path.t[0] + np.linspace(0.01, 0.9, 20) * period
+    parts = np.linspace(0.01, 0.9, 20)
+    times = path.t[0] + parts * period
     feet = [x.points["stance foot"] for x in pictures.at(times)] + pictures.camera(
         times
     )
@@ -78,24 +80,28 @@ def test_both_halves_of_a_cycle_are_drawn():
     )
     motion = hj.plot.animate(half)
     span = len(motion.times) * motion.times[1]
-    assert_allclose([span, 2 * half.period], float(duffing.period()), rtol=1e-9)
+    spans = [span, 2 * half.period]
+    assert_allclose(spans, float(duffing.period()), rtol=1e-9)
 
 
 def test_no_input_gives_the_cycle():
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     placed = hj.sections.place_sections(cycle, hj.ClockPhase(4))
-    path = hj.experiments.perturbed_trajectory(placed, np.zeros((8, 1)))
-    end = path.at(path.t[-1:])[1] - path.at(path.t[:1])[1]
+    no_pushes = np.zeros((8, 1))
+    path = hj.experiments.perturbed_trajectory(placed, no_pushes)
+    last = path.at(path.t[-1:])[1]
+    first = path.at(path.t[:1])[1]
+    end = last - first
     assert_allclose(end, 0, atol=1e-9)
     data = hj.experiments.ExperimentData(
         np.zeros((1, 8, 1)), np.zeros((1, 8, 1)), n_sections=4, periods=2
     )
     motion = hj.plot.animate(cycle, sections=placed, perturbed=data)
-    error = abs(motion.interval * len(motion.times) - 2 * float(cycle.period))
+    shown = motion.interval * len(motion.times)
+    error = abs(shown - 2 * float(cycle.period))
     assert error < 1e-9
     motion.figure.draw_without_rendering()
-    assert all(
-        motion.figure.bbox.y1 > x.title.get_tightbbox().y1 for x in motion.figure.axes
-    )
+    for x in motion.figure.axes:
+        assert motion.figure.bbox.y1 > x.title.get_tightbbox().y1
     with pytest.raises(hj.errors.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)

@@ -9,7 +9,9 @@ from .test_plots import labeled
 
 def test_cycle_with_sections_and_a_perturbed_trajectory(hopper_cycle, placed_kinematic):
     lanes = placed_kinematic.lanes
-    start = np.asarray(lanes.q[:, 0]) + [0.03, 0, 0, 0]
+    push = [0.03, 0, 0, 0]
+    state = np.asarray(lanes.q[:, 0])
+    start = state + push
     perturbed = hj.simulate(
         hopper_cycle.system, "flight", start, 2.0, time=float(lanes.t[0])
     )
@@ -59,13 +61,16 @@ def test_bars_lie_on_their_sections(hopper_cycle, placed_kinematic):
     """Rays from the center of the kinematic phase, in equal angles."""
     ax = hj.plot.cycle(hopper_cycle, sections=placed_kinematic).ax
     drawn = labeled(ax)["sections (32)"].get_xydata()
-    bars = drawn.reshape(32, 3, 2)[:, :2]  # the third point is a gap
+    paths = drawn.reshape(32, 3, 2)
+    bars = paths[:, :2]  # the third point is a gap
     middles = bars.mean(axis=1).T
     assert_allclose(middles, placed_kinematic.lanes.q[:2], atol=1e-9)
-    x, y = np.moveaxis((bars - [1.9, 0.0]) / [0.3, 1.9], 2, 0)
+    scaled = (bars - [1.9, 0.0]) / [0.3, 1.9]
+    x, y = np.moveaxis(scaled, 2, 0)
     angle = np.unwrap(np.arctan2(y, x), axis=0)
     assert_allclose(angle[:, 0], angle[:, 1], atol=1e-9)
-    assert_allclose(np.diff(angle[:, 0]), -2 * np.pi / 32, atol=1e-9)
+    turns = np.diff(angle[:, 0])
+    assert_allclose(turns, -2 * np.pi / 32, atol=1e-9)
 
 
 def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
@@ -74,6 +79,7 @@ def test_autonomous_cycle_with_sections_across_it(vanderpol_cycle):
     assert ax.get_xlabel() == "v"
     assert ax.get_ylabel() == "x"
     drawn = labeled(ax)["sections (6)"].get_xydata()
-    bars = drawn.reshape(6, 3, 2)[:, :2]
+    paths = drawn.reshape(6, 3, 2)
+    bars = paths[:, :2]
     middles = bars.mean(axis=1).T
     assert_allclose(middles, placed.lanes.q[::-1], atol=1e-9)

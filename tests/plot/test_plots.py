@@ -28,7 +28,9 @@ def test_magnitude_draws_the_values(estimate, exact):
     assert list(lines) == ["$H_{0}$", "$H_{1}$", "$H_{-1}$", "exact"]
     drawn = lines["$H_{1}$"]
     assert_array_equal(drawn.get_xdata(), estimate.frequencies)
-    assert_array_equal(drawn.get_ydata(), np.abs(estimate[1][:, 1, 0]))
+    first_harmonic = estimate[1][:, 1, 0]
+    modulus = np.abs(first_harmonic)
+    assert_array_equal(drawn.get_ydata(), modulus)
     assert (
         drawn.get_color()
         == lines["$H_{-1}$"].get_color()
@@ -55,7 +57,9 @@ def test_a_model_is_drawn_beside_an_estimate(hopper, estimate, exact):
     f, size = drawn.get_xydata().T
     assert f[0] == 0
     assert f[-1] == 16
-    assert_allclose(size, abs(hopper.htf(f, harmonics=0).H[0, :, 0, 0]), rtol=1e-9)
+    response = hopper.htf(f, harmonics=0).H
+    H = response[0, :, 0, 0]
+    assert_allclose(size, abs(H), rtol=1e-9)
     hj.plot.bode(hopper.htf([0.3]))  # a single frequency
 
 
@@ -88,8 +92,10 @@ def test_bode_with_fits(estimate, exact, rational, structured):
     assert upper.get_ylabel() == "$|H_{0}|$"
     assert "degrees" in lower.get_ylabel()
     curves = [x for x in upper.get_lines() if len(x.get_xdata())]
-    assert len(curves) == len(lower.get_lines()) == 2 * 4
-    fitted = rational.htf(estimate.frequencies).H[0, :, 0, 0]
+    lower_curves = lower.get_lines()
+    assert len(curves) == len(lower_curves) == 2 * 4
+    response = rational.htf(estimate.frequencies)
+    fitted = response.H[0, :, 0, 0]
     assert_allclose(curves[2].get_ydata(), np.abs(fitted))
     phases = [x.get_ydata() for x in lower.get_lines()]
     assert_allclose(phases[0], phases[3], atol=2)  # no curve is a whole turn away
@@ -98,7 +104,8 @@ def test_bode_with_fits(estimate, exact, rational, structured):
 
 def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     """Indices are those of the first HTF, and a fit is drawn over its own input."""
-    exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
+    f = np.linspace(0.05, 1.4, 12)
+    exact = hj.testing.synthetic_ldtp().htf(f, 0)
     swapped = hj.linear.HTF(
         exact.frequencies,
         exact.H[..., ::-1, ::-1],
@@ -120,7 +127,9 @@ def test_curves_of_one_input_and_output_lie_together_in_any_order_of_names():
     for draw, shown in ((hj.plot.htf, {"harmonics": [0]}), (hj.plot.bode, {})):
         first, second, *_ = draw(exact, swapped, input=1, **shown).ax.lines
         draw(exact, renamed, input=1, **shown)
-        assert_allclose(first.get_ydata(), np.abs(exact[0][:, 0, 1]))
+        H_0 = exact[0][:, 0, 1]
+        modulus = np.abs(H_0)
+        assert_allclose(first.get_ydata(), modulus)
         assert_array_equal(first.get_ydata(), second.get_ydata())
     fit = hj.identify.fit_rational(exact, input=1)
     with pytest.raises(
@@ -133,22 +142,26 @@ def test_bode_in_hertz_and_decibels(estimate):
     """As python-control draws it, with a gain of 20 log10 and the frequencies in units of time."""
 
     def drawn(**options):
-        upper, lower = hj.plot.bode(estimate, outputs="vM", **options).axes[:, 0]
+        axes = hj.plot.bode(estimate, outputs="vM", **options).axes
+        upper, lower = axes[:, 0]
         return upper, lower, labeled(upper)["vM"]
 
     upper, lower, gain = drawn(unit="Hz", period=0.5, log=True)
     f = np.asarray(estimate.frequencies)
     assert_allclose(gain.get_xdata(), f / 0.5)
-    decibels = 20 * np.log10(np.abs(estimate[0][:, 1, 0]))
+    modulus = np.abs(estimate[0][:, 1, 0])
+    decibels = 20 * np.log10(modulus)
     assert_allclose(gain.get_ydata(), decibels)
-    assert_allclose(lower.get_lines()[0].get_xdata(), f / 0.5)
+    hertz = lower.get_lines()[0].get_xdata()
+    assert_allclose(hertz, f / 0.5)
     assert (upper.get_xscale(), lower.get_xscale()) == ("log", "log")
     assert upper.get_yscale() == "linear"
     assert "(Hz)" in lower.get_xlabel()
     assert "dB" in upper.get_ylabel()
     upper, lower, gain = drawn(unit="rad/s", period=0.5)
     assert_allclose(gain.get_xdata(), 4 * np.pi * f)
-    assert_allclose(gain.get_ydata(), np.abs(estimate[0][:, 1, 0]))
+    modulus = np.abs(estimate[0][:, 1, 0])
+    assert_allclose(gain.get_ydata(), modulus)
     assert (upper.get_xscale(), upper.get_yscale()) == ("linear", "log")
     with pytest.raises(hj.errors.DefinitionError, match="needs the `period`"):
         drawn(unit="Hz")
@@ -166,7 +179,8 @@ def test_the_period_of_a_cycle_is_in_its_own_unit(estimate):
 
     drawn = hj.plot.bode(estimate, unit="Hz", period=cycle("ms"))
     line = drawn.axes[0, 0].get_lines()[0]
-    assert_allclose(line.get_xdata(), np.asarray(estimate.frequencies) * 50)
+    frequencies = np.asarray(estimate.frequencies)
+    assert_allclose(line.get_xdata(), frequencies * 50)
     with pytest.raises(hj.errors.DefinitionError, match="'strides', is none of s,"):
         hj.plot.bode(estimate, unit="Hz", period=cycle("strides"))
 
@@ -189,7 +203,8 @@ def harmonics(*given, **options):
 @pytest.fixture
 def two_inputs():
     """An exact HTF from two inputs to two outputs."""
-    exact = hj.testing.synthetic_ldtp().htf(np.linspace(0.05, 1.4, 12), 0)
+    f = np.linspace(0.05, 1.4, 12)
+    exact = hj.testing.synthetic_ldtp().htf(f, 0)
     assert len(exact.inputs) == 2
     assert len(exact.outputs) == 2
     return exact
@@ -202,8 +217,12 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
     pairs = [(0, 0), (0, 1), (1, 0), (1, 1)]
     names = []
     for curve, (i, j) in zip(curves, pairs, strict=True):
-        assert_allclose(curve.get_ydata(), np.abs(two_inputs[0][:, i, j]))
-        names.append(f"{two_inputs.outputs[i]} from {two_inputs.inputs[j]}")
+        H_0 = two_inputs[0][:, i, j]
+        modulus = np.abs(H_0)
+        assert_allclose(curve.get_ydata(), modulus)
+        output = two_inputs.outputs[i]
+        source = two_inputs.inputs[j]
+        names.append(f"{output} from {source}")
     assert list(labeled(upper)) == [*names, "exact"]
     colors = {curve.get_color() for curve in curves}
     assert len(colors) == 4, "a color for each pair"
@@ -212,7 +231,8 @@ def test_every_input_is_drawn_and_named(draw, two_inputs):
 def test_bodes(estimate, exact, rational):
     families = {"a": (estimate, exact), "b": estimate}
     figure = hj.plot.bode(families, fits={"b": rational}).figure
-    measured = [len(ax.get_lines()) for ax in np.reshape(figure.axes, (2, 2))[1]]
+    lower_axes = np.reshape(figure.axes, (2, 2))[1]
+    measured = [len(ax.get_lines()) for ax in lower_axes]
     assert measured == [4, 4]
     with pytest.raises(hj.errors.DefinitionError, match="`fits`: there is no name 'c'"):
         hj.plot.bode(families, fits={"c": rational})
@@ -233,7 +253,8 @@ def test_a_fit_lies_over_the_curves_of_its_own_input(two_inputs):
 def test_the_name_of_a_single_input_is_on_the_axis(draw, two_inputs):
     output = two_inputs.outputs[0]
     first, second = two_inputs.inputs
-    label = draw(two_inputs, harmonics=[0]).figure.axes[0].get_ylabel()
+    drawn = draw(two_inputs, harmonics=[0])
+    label = drawn.figure.axes[0].get_ylabel()
     assert label.startswith(f"$|H_m|$, {output} from {first}")
     label = draw(two_inputs, harmonics=[0], input=1).figure.axes[0].get_ylabel()
     assert label.startswith(f"$|H_m|$, {output} from {second}")
@@ -271,7 +292,8 @@ def test_poles_and_zeros(rational):
     assert len(figure.axes) == 4
     for i, ax in enumerate(figure.axes[:2]):
         poles = labeled(ax)["poles, isochron"].get_xydata()
-        assert_array_equal(poles[:, 1], rational.poles[i].imag)
+        imaginary = rational.poles[i].imag
+        assert_array_equal(poles[:, 1], imaginary)
     (legend,) = figure.legends
     assert len(legend.get_texts()) == 4
     with pytest.raises(hj.errors.DefinitionError, match="one or more fits"):
@@ -288,7 +310,8 @@ def test_experiment(hopper):
         r"$\delta$ vM",
     ]
     y = figure.axes[2].get_lines()[0]
-    assert_array_equal(y.get_ydata(), data.y[-1, :, 1])
+    last = data.y[-1, :, 1]
+    assert_array_equal(y.get_ydata(), last)
     assert_allclose(y.get_xdata()[32], 1.0)
     assert "cycles" in figure.axes[2].get_xlabel()
     with pytest.raises(hj.errors.DefinitionError, match="no experiment 99"):
@@ -297,13 +320,15 @@ def test_experiment(hopper):
 
 def test_saved_in_several_formats(tmp_path):
     plot = hj.plot.multipliers([0.5])
-    png, pdf, svg = plot.save(tmp_path / "multipliers.png", ("png", "pdf", "svg"))
+    formats = ("png", "pdf", "svg")
+    png, pdf, svg = plot.save(tmp_path / "multipliers.png", formats)
     assert png.read_bytes()[:4] == b"\x89PNG"
     assert pdf.read_bytes()[:5] == b"%PDF-"
     assert "<svg" in svg.read_text()
     expected = [f"multipliers.{x}" for x in ("png", "pdf", "svg")]
     assert [p.name for p in (png, pdf, svg)] == expected
-    assert plot.save(str(tmp_path / "v1.0")) == (tmp_path / "v1.0.png",)
+    files = plot.save(str(tmp_path / "v1.0"))
+    assert files == (tmp_path / "v1.0.png",)
     assert len(list(tmp_path.iterdir())) == 4
     assert isinstance(plot.figure.get_layout_engine(), ConstrainedLayoutEngine)
     with pytest.raises(hj.errors.DefinitionError, match="x.bmp': formats are png"):
@@ -312,8 +337,10 @@ def test_saved_in_several_formats(tmp_path):
 
 def test_a_crowd_of_multipliers_has_no_inset():
     ticks = np.arange(-4, 5) / 6
-    crowd = (ticks[:, None] + 1j * ticks).ravel()
-    ax = hj.plot.multipliers(crowd, {"near": crowd + 1e-3}).ax
+    grid = ticks[:, None] + 1j * ticks
+    crowd = grid.ravel()
+    apart = crowd + 1e-3
+    ax = hj.plot.multipliers(crowd, {"near": apart}).ax
     assert not ax.child_axes
 
 
@@ -323,13 +350,15 @@ def test_bands_hold_the_values(estimate):
     variance = np.full(estimate.H.shape, 1e-6)
     sure = dataclasses.replace(estimate, variance=variance)
     radius = float(sure.confidence_radius().max())
-    modulus = np.abs(sure[0][:, 0, 0])
+    H_0 = sure[0][:, 0, 0]
+    modulus = np.abs(H_0)
 
     (band,) = hj.plot.htf(sure, harmonics=(0,), output="yM").ax.collections
     heights = band.get_paths()[0].vertices[:, 1]
     assert_allclose(heights.max(), modulus.max() + radius)
 
-    upper, lower = hj.plot.bode(sure, outputs="yM").axes[:, 0]
+    axes = hj.plot.bode(sure, outputs="yM").axes
+    upper, lower = axes[:, 0]
     phase = lower.get_lines()[0].get_ydata()
     assert_array_equal(np.isfinite(phase), modulus > radius)
     assert len(upper.collections) == 1
@@ -338,10 +367,12 @@ def test_bands_hold_the_values(estimate):
 
 @pytest.fixture(scope="module")
 def found(hopper):
-    u = 0.02 * np.random.default_rng(0).normal(size=(32 * 40, 1))
+    rng_of_input = np.random.default_rng(0)
+    u = 0.02 * rng_of_input.normal(size=(32 * 40, 1))
     y = np.asarray(hopper.simulate(u))
     rng = np.random.default_rng(1)
-    y = y + 0.1 * y.std(axis=0) * rng.normal(size=y.shape)
+    size = 0.1 * y.std(axis=0)
+    y = y + size * rng.normal(size=y.shape)
     return hj.validate(
         hopper, hj.experiments.SectionSeries(u, y, n_sections=32, outputs=("yM", "vM"))
     )
@@ -351,16 +382,21 @@ def test_validation_draws_signals_and_correlations(found):
     figure = found.plot(cycles=2).figure
     upper, lower = np.reshape(figure.axes, (2, 3))
     simulated, measured = lower[0].get_lines()
-    assert_array_equal(simulated.get_ydata(), found.simulated[-64:, 1])
-    assert_array_equal(measured.get_ydata(), found.measured[-64:, 1])
-    assert_allclose(measured.get_xdata(), 38 + np.arange(64) / 32)
+    simulated_end = found.simulated[-64:, 1]
+    assert_array_equal(simulated.get_ydata(), simulated_end)
+    measured_end = found.measured[-64:, 1]
+    assert_array_equal(measured.get_ydata(), measured_end)
+    cycles = 38 + np.arange(64) / 32
+    assert_allclose(measured.get_xdata(), cycles)
     assert lower[0].get_ylabel() == r"$\delta$ vM"
-    assert upper[0].get_title("right") == f"fit {found.fit[0]:.3g} %\n"
+    title = f"fit {found.fit[0]:.3g} %\n"
+    assert upper[0].get_title("right") == title
     drawn = {upper[1]: found.autocorrelation, upper[2]: found.cross_correlation}
     for ax, correlation in drawn.items():
         bars = ax.collections[0].get_paths()
         heights = [bar.vertices[1, 1] for bar in bars]
-        expected = correlation[:, :, 0].sum(axis=0).ravel() / np.sqrt(32)
+        over_sections = correlation[:, :, 0].sum(axis=0)
+        expected = over_sections.ravel() / np.sqrt(32)
         assert_allclose(heights, expected, atol=1e-12)
 
 
@@ -393,11 +429,16 @@ def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
     plot.figure.canvas.draw()
     picture = np.asarray(plot.figure.canvas.buffer_rgba())
     blue = [0, 0x72, 0xB2]
-    is_blue = np.abs(picture[..., :3] - blue).sum(axis=2) < 60
+    apart = np.abs(picture[..., :3] - blue)
+    distance = apart.sum(axis=2)
+    is_blue = distance < 60
     for end in (value - half_width, value + half_width):
-        column, height = plot.ax.transData.transform((end, 0)).round().astype(int)
+        place = plot.ax.transData.transform((end, 0)).round()
+        column, height = place.astype(int)
         row = len(picture) - height
-        cap = is_blue[row - 8 : row + 8, column - 2 : column + 3]
+        rows = slice(row - 8, row + 8)
+        columns = slice(column - 2, column + 3)
+        cap = is_blue[rows, columns]
         pixels_high = cap.any(axis=1).sum()
         assert pixels_high > 6, "the line itself is one or two pixels high"
 
@@ -405,11 +446,13 @@ def test_the_interval_of_a_real_multiplier_has_ends_that_are_seen():
 def test_regions_are_drawn_around_estimates(hopper):
     true = hopper.multipliers
     coefficients = np.poly(true).real[1:]
-    estimate = MultiplierEstimate(true * 1.01, coefficients, 1e-4 * np.eye(2), np.inf)
+    covariance = 1e-4 * np.eye(2)
+    estimate = MultiplierEstimate(true * 1.01, coefficients, covariance, np.inf)
     border = estimate.ellipse(0)
     (inset,) = hj.plot.multipliers(hopper, {"fit": estimate}).ax.child_axes
     ellipses = [line for line in inset.get_lines() if len(line.get_xdata()) == 100]
-    assert_array_equal(ellipses[0].get_xydata() @ [1, 1j], border)
+    drawn = ellipses[0].get_xydata() @ [1, 1j]
+    assert_array_equal(drawn, border)
     (left, right) = inset.get_xlim()
     (low, high) = inset.get_ylim()
     assert left < border.real.min()

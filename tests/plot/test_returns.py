@@ -28,7 +28,8 @@ class Logistic(hj.HybridSystem):
         return [jump]
 
     def after(self, t, q, u):
-        return (self.r * q[0] * (1 - q[0]),)
+        rest = 1 - q[0]
+        return (self.r * q[0] * rest,)
 
     def period(self):
         return 1.0
@@ -47,17 +48,22 @@ def test_the_logistic_map_and_its_cobweb():
     plot = hj.plot.return_map(cycle, range=(0.3, 0.95), start=0.4, iterates=6)
     lines = lines_of(plot)
     x, after = lines["return map"]
-    assert (x[0], x[-1]) == (0.3, 0.95)
+    ends = (x[0], x[-1])
+    assert ends == (0.3, 0.95)
     assert_allclose(after, r * x * (1 - x), atol=1e-12)
     assert "slope -0.8: multiplier" in lines  # 2 - r
     near, tangent = lines["slope -0.8: multiplier"]
-    assert_allclose(np.diff(tangent) / np.diff(near), 2 - r, rtol=1e-9)
+    slope = np.diff(tangent) / np.diff(near)
+    assert_allclose(slope, 2 - r, rtol=1e-9)
     iterates = [0.4]
     for _ in range(6):
-        iterates.append(r * iterates[-1] * (1 - iterates[-1]))
+        last = iterates[-1]
+        iterates.append(r * last * (1 - last))
     corners_x, corners_y = lines["from 0.4"]
-    assert_allclose(corners_x, np.repeat(iterates, 2)[:-1], atol=1e-12)
-    assert_allclose(corners_y[1:], np.repeat(iterates[1:], 2), atol=1e-12)
+    expected_x = np.repeat(iterates, 2)[:-1]
+    assert_allclose(corners_x, expected_x, atol=1e-12)
+    twice = np.repeat(iterates[1:], 2)
+    assert_allclose(corners_y[1:], twice, atol=1e-12)
     (fixed,), _ = lines["cycle"]
     assert_allclose(fixed, 1 - 1 / r, atol=1e-12)
     bare = lines_of(hj.plot.return_map(cycle, cobweb=False))
@@ -79,11 +85,13 @@ def test_the_slope_in_several_dimensions_is_the_multiplier():
         lambda t, q, u, p: (1.0 - 0.2 * q[0], q[0] - 0.5 * q[1]),
         period=1.0,
     )
-    cycle = hj.find_limit_cycle(system, hj.Guess("main", (1.0, 1.0)))
+    guess = hj.Guess("main", (1.0, 1.0))
+    cycle = hj.find_limit_cycle(system, guess)
     for coordinate in (None, "x", "y"):
         lines = lines_of(hj.plot.return_map(cycle, coordinate, cobweb=False))
         x, after = lines["return map"]
-        assert_allclose(np.diff(after) / np.diff(x), np.exp(-0.2), rtol=1e-4)
+        slope = np.diff(after) / np.diff(x)
+        assert_allclose(slope, np.exp(-0.2), rtol=1e-4)
         assert f"slope {np.exp(-0.2):.4g}: multiplier" in lines
 
 
@@ -96,10 +104,14 @@ def test_states_that_do_not_return_are_gaps():
     plot = hj.plot.return_map(cycle, range=(-1.5, 1.5), start=0.9)
     x, after = lines_of(plot)["return map"]
     lost = 1 / np.sqrt(1 - np.exp(-2))
-    assert_array_equal(np.isfinite(after), np.abs(x) < lost)
+    returns = np.abs(x) < lost
+    assert_array_equal(np.isfinite(after), returns)
     kept = x[np.abs(x) < lost]
-    exact = kept / np.sqrt(kept**2 + (1 - kept**2) * np.exp(2))
-    assert_allclose(after[np.abs(x) < lost], exact, atol=1e-9)
+    square = kept**2
+    left = (1 - square) * np.exp(2)
+    exact = kept / np.sqrt(square + left)
+    inner = after[np.abs(x) < lost]
+    assert_allclose(inner, exact, atol=1e-9)
 
 
 def test_wrong_coordinates_ranges_and_cycles_are_refused():

@@ -32,9 +32,12 @@ def wave():
     t = np.linspace(0.0, 20.0, 2001)
     rng = np.random.default_rng(0)
     x_noise, v_noise = 1e-6 * rng.normal(size=(2, len(t)))
-    x = np.cos(2 * np.pi * t) + x_noise
-    v = -np.sin(2 * np.pi * t) + v_noise
-    return hj.Recording(t, {"f": np.cos(3 * t), "x": x, "v": v})
+    cosine = np.cos(2 * np.pi * t)
+    x = cosine + x_noise
+    sine = np.sin(2 * np.pi * t)
+    v = -sine + v_noise
+    signals = {"f": np.cos(3 * t), "x": x, "v": v}
+    return hj.Recording(t, signals)
 
 
 @pytest.fixture(scope="session")
@@ -44,22 +47,29 @@ def rhythm():
     z' = (2 pi i + a (1 - |z|^2)) z + f by Runge-Kutta's method, f linear between samples. It turns
     with the clock of a drive: its angle is pulled towards 2 pi t at the same rate.
     """
-    force = hj.experiments.random_input(STRIDES, RATE, 8, rms=0.02, seed=0)[:, 0]
+    inputs = hj.experiments.random_input(STRIDES, RATE, 8, rms=0.02, seed=0)
+    force = inputs[:, 0]
     steps = 2  # from one sample to the next
     h = 1 / RATE / steps
     sampled = np.arange(len(force)) / RATE
-    halves = np.arange(2 * steps * len(force) + 1) * h / 2
+    steps_in_half = np.arange(2 * steps * len(force) + 1)
+    halves = steps_in_half * h / 2
     fine = np.interp(halves, sampled, force)
 
     def field(w, f, turn):
         """Of w = z exp(-2 pi i t), with turn = exp(-2 pi i t)."""
-        pull = -1j * DECAY * 2 * np.angle(w) * w
-        return DECAY * (1 - abs(w) ** 2) * w + pull + f * turn
+        turned = 2 * np.angle(w) * w
+        pull = -1j * DECAY * turned
+        distance = 1 - abs(w) ** 2
+        growth = DECAY * distance * w
+        return growth + pull + f * turn
 
     w = 1.0 + 0j
     samples = []
     for k in range(steps * len(force)):
-        begin, middle, end = np.exp(-2j * np.pi * halves[2 * k : 2 * k + 3])
+        of_step = halves[2 * k : 2 * k + 3]
+        phases = -2j * np.pi * of_step
+        begin, middle, end = np.exp(phases)
         f_begin, f_middle, f_end = fine[2 * k : 2 * k + 3]
         if k % steps == 0:
             samples.append(w / begin)
@@ -67,6 +77,8 @@ def rhythm():
         b = field(w + h / 2 * a, f_middle, middle)
         c = field(w + h / 2 * b, f_middle, middle)
         d = field(w + h * c, f_end, end)
-        w = w + h / 6 * (a + 2 * b + 2 * c + d)
+        slopes = a + 2 * b + 2 * c + d
+        w = w + h / 6 * slopes
     z = np.array(samples)
-    return hj.Recording(sampled, {"force": force, "x": z.real, "v": z.imag})
+    signals = {"force": force, "x": z.real, "v": z.imag}
+    return hj.Recording(sampled, signals)

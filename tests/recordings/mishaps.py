@@ -23,17 +23,21 @@ class Scene(NamedTuple):
 
     @property
     def period(self):
-        return float(np.median(np.diff(self.trial.events[self.event])))
+        durations = np.diff(self.trial.events[self.event])
+        return float(np.median(durations))
 
     @property
     def cycles(self):
         """Times since the trial's start, in cycles."""
-        return (self.trial.time - self.trial.time[0]) / self.period
+        elapsed = self.trial.time - self.trial.time[0]
+        return elapsed / self.period
 
     @property
     def from_middle(self):
         """Distances of samples from the middle of the trial, in cycles."""
-        return np.abs(self.trial.time - self.trial.time.mean()) / self.period
+        middle = self.trial.time.mean()
+        distance = np.abs(self.trial.time - middle)
+        return distance / self.period
 
     def normal(self):
         return self.rng.normal(size=len(self.trial.time))
@@ -118,7 +122,8 @@ def placeholder(value, cycles):
 
 def frozen(which, share):
     def freeze(x, s):
-        first = int((1 - share) / 2 * len(x))
+        part = (1 - share) / 2
+        first = int(part * len(x))
         rows = np.arange(len(x))
         return np.where(
             (rows >= first) & (rows < first + round(share * len(x))), x[first], x
@@ -134,7 +139,8 @@ def scaled(which, gain=1.0, offset=0.0):
 def overflow(bits):
     def wrap(x, s):
         step = 0.8 * np.ptp(x) / 2**bits
-        return np.round((x - x.min()) / step) % 2**bits * step + x.min()
+        codes = np.round((x - x.min()) / step)
+        return codes % 2**bits * step + x.min()
 
     return wrap
 
@@ -145,13 +151,15 @@ def renumbered(trial, s):
     t = kept(
         trial, ~np.isin(np.arange(n) // 32, s.rng.choice(n // 32, 3, replace=False))
     )
-    time = trial.time[0] + step * np.arange(len(t.time))
+    elapsed = step * np.arange(len(t.time))
+    time = trial.time[0] + elapsed
     events = {k: np.interp(at, t.time, time) for k, at in t.events.items()}
     return replace(t, time=time, events=events)
 
 
 def slow_sensor(x, s):
-    rate = 1 / np.median(np.diff(s.trial.time))
+    step = np.median(np.diff(s.trial.time))
+    rate = 1 / step
     sos = signal.butter(2, 8.0 / s.period, fs=rate, output="sos")
     return signal.sosfilt(sos, x - x[0]) + x[0]
 
@@ -162,8 +170,11 @@ def hidden(choose):
     def hide(trial, s):
         values = trial.values.copy()
         middles = choose(trial.events[s.event], s)
-        away = np.abs(trial.time[:, None] - middles).min(axis=1) < 0.075 * s.period
-        values[np.ix_(away, [s.recording.column(x) for x in s.outputs])] = np.nan
+        apart = trial.time[:, None] - middles
+        distance = np.abs(apart)
+        away = distance.min(axis=1) < 0.075 * s.period
+        columns = [s.recording.column(x) for x in s.outputs]
+        values[np.ix_(away, columns)] = np.nan
         return replace(trial, values=values)
 
     return trials(hide)
@@ -197,7 +208,9 @@ def late(samples, only=None):
 
 def other_clock(x, s):
     start = s.trial.time[0]
-    return np.interp(start + (s.trial.time - start) * (1 - 0.005), s.trial.time, x)
+    since = s.trial.time - start
+    later = start + since * (1 - 0.005)
+    return np.interp(later, s.trial.time, x)
 
 
 def misjudged(lost=0.0, doubled=0.0, off=0.0):
@@ -208,9 +221,14 @@ def misjudged(lost=0.0, doubled=0.0, off=0.0):
         at = trial.events[s.event]
         order = s.rng.permutation(len(at))
         n = round(lost * len(at))
-        again = order[n : n + round(doubled * len(at))]
-        at = np.concatenate([np.delete(at, order[:n]), at[again] + 0.05 * s.period])
-        at = np.sort(at + off * s.period * s.rng.normal(size=len(at)))
+        count = round(doubled * len(at))
+        again = order[n : n + count]
+        missed = np.delete(at, order[:n])
+        doubles = at[again] + 0.05 * s.period
+        at = np.concatenate([missed, doubles])
+        errors = s.rng.normal(size=len(at))
+        late = off * s.period * errors
+        at = np.sort(at + late)
         return replace(trial, events=trial.events | {s.event: at})
 
     return trials(misjudge)
@@ -222,7 +240,8 @@ def with_copies(recording, *_):
 
 
 def with_end(recording, *_):
-    end = kept(recording.trials[0], slice(len(recording.trials[0].time) // 2, None))
+    half = len(recording.trials[0].time) // 2
+    end = kept(recording.trials[0], slice(half, None))
     return [*recording.trials, replace(end, name="end")]
 
 

@@ -23,7 +23,8 @@ def samples(recording, name):
     """Times and values of one signal where it was sampled."""
     (trial,) = recording.trials
     x = trial.values[:, recording.column(name)]
-    return trial.time[np.isfinite(x)], x[np.isfinite(x)]
+    known = np.isfinite(x)
+    return trial.time[known], x[known]
 
 
 def check_two_rates(path, x="x", f="f", digits=15, **how):
@@ -32,14 +33,16 @@ def check_two_rates(path, x="x", f="f", digits=15, **how):
     for name, time, values in ((x, SLOW, X), (f, FAST, F)):
         t, v = samples(found, name)
         np.testing.assert_allclose(t, time, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(v, values, rtol=10.0**-digits, atol=10.0**-digits)
+        tolerance = 10.0**-digits
+        np.testing.assert_allclose(v, values, rtol=tolerance, atol=tolerance)
     return found
 
 
 def refused(says, *paths, kind=FileFormatError, **how):
     with pytest.raises(kind, match=says) as error:
         hj.read_recording(*paths, **how)
-    assert str(paths[0]) in str(error.value) and "\n" not in str(error.value)
+    assert str(paths[0]) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 # MATLAB and HDF5
@@ -71,7 +74,9 @@ def write_v73(path, variables):
     with h5py.File(path, "w", userblock_size=512) as file:
         fill(file, variables)
     with open(path, "r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + bytes([0, 2]) + b"IM")
+        mark = b"MATLAB 7.3 MAT-file".ljust(124)
+        version = bytes([0, 2])
+        file.write(mark + version + b"IM")
 
 
 NESTED = {
@@ -90,8 +95,10 @@ def test_matlab(tmp_path, write):
     found = check_two_rates(tmp_path / "x.mat", f="force.f")
     assert set(found.signals) == {"force.f", "x", "pair.0", "pair.1"}
     np.testing.assert_array_equal(samples(found, "pair.1")[1], 2 * X)
-    np.testing.assert_array_equal(found.trials[0].events["strike"], [0.05, 0.1])
-    write(tmp_path / "y.mat", {"time": SLOW, "x": X, "f": F})
+    strikes = found.trials[0].events["strike"]
+    np.testing.assert_array_equal(strikes, [0.05, 0.1])
+    signals = {"time": SLOW, "x": X, "f": F}
+    write(tmp_path / "y.mat", signals)
     refused("'f' has the shape .*190.*, but its group 20 times", tmp_path / "y.mat")
     refused(
         "no times 't' for '[ftx]",
@@ -100,7 +107,8 @@ def test_matlab(tmp_path, write):
         kind=hj.errors.DefinitionError,
     )
     only = hj.read_recording(tmp_path / "x.mat", signals="pair", units={"pair.0": "m"})
-    assert only.signals == ("pair.0", "pair.1") and only.unit("pair.0") == "m"
+    assert only.signals == ("pair.0", "pair.1")
+    assert only.unit("pair.0") == "m"
     assert len(only.trials[0].time) == len(SLOW)
     says = "no signal 'f'; it has .*force.f"
     refused(says, tmp_path / "x.mat", signals="f", kind=hj.errors.DefinitionError)
@@ -116,7 +124,8 @@ def test_arrays_of_structs(tmp_path):
     write_v73(tmp_path / "y.mat", {"time": SLOW, "x": X})
     with h5py.File(tmp_path / "y.mat", "r+") as file:
         group = file.create_group("trials")
-        group["x"] = np.array([file["x"].ref, file["x"].ref], h5py.ref_dtype)
+        references = [file["x"].ref, file["x"].ref]
+        group["x"] = np.array(references, h5py.ref_dtype)
     refused("'trials' is an array of structs", tmp_path / "y.mat")
     assert hj.read_recording(tmp_path / "y.mat", signals="x").signals == ("x",)
 
@@ -125,12 +134,16 @@ def test_hdf5(tmp_path):
     h5py = pytest.importorskip("h5py")
     path = tmp_path / "x.h5"
     with h5py.File(path, "w") as file:
-        file["time"], file["x"], file["daq/f"] = SLOW, X, F
+        file["time"] = SLOW
+        file["x"] = X
+        file["daq/f"] = F
         file["daq/time"] = 1000 * FAST
-        file["daq/time"].attrs["units"], file["daq/f"].attrs["units"] = "ms", "N"
+        file["daq/time"].attrs["units"] = "ms"
+        file["daq/f"].attrs["units"] = "N"
         file["note"] = "left leg"
     found = check_two_rates(path, f="daq/f")
-    assert found.unit("daq/f") == "N" and found.unit("x") == ""
+    assert found.unit("daq/f") == "N"
+    assert found.unit("x") == ""
     assert hj.read_recording(path, signals="daq").signals == ("daq/f",)
     with h5py.File(path, "r+") as file:
         file["x"].attrs["units"] = np.nan
@@ -163,7 +176,9 @@ def test_feather(tmp_path):
     table(y=X).to_feather(tmp_path / "x.feather")
     found = hj.read_recording(tmp_path / "x.feather", signals="x")
     np.testing.assert_array_equal(samples(found, "x")[1], X)
-    assert found.unit("x") == "m" and found.trials[0].events["go"] == [SLOW[7]]
+    assert found.unit("x") == "m"
+    events = found.trials[0].events["go"]
+    assert events == [SLOW[7]]
     refused(
         "no signal 'z'; it has ",
         tmp_path / "x.feather",
@@ -171,9 +186,12 @@ def test_feather(tmp_path):
         kind=hj.errors.DefinitionError,
     )
     with pytest.raises(hj.errors.DefinitionError, match="different indices"):
-        hj.Recording(table()["time"], {"y": table()["x (m)"][::-1]})
+        backwards = table()["x (m)"][::-1]
+        hj.Recording(table()["time"], {"y": backwards})
     with pytest.raises(hj.errors.DefinitionError, match="different indices"):
-        hj.Recording.from_frame({"time": table()["time"], "y": table()["x (m)"][::-1]})
+        backwards_again = table()["x (m)"][::-1]
+        values = table()
+        hj.Recording.from_frame({"time": values["time"], "y": backwards_again})
     (tmp_path / "x.feather").write_bytes(b"ARROW1" + bytes(100))
     refused("no feather file, or damaged", tmp_path / "x.feather")
 
@@ -188,7 +206,8 @@ def test_excel(tmp_path):
         ["ms", None],
         *zip(1000 * SLOW, X, strict=True),
     ):
-        book.active.append([float(v) if isinstance(v, np.floating) else v for v in row])
+        plain = [float(v) if isinstance(v, np.floating) else v for v in row]
+        book.active.append(plain)
     book.active["B8"] = None
     book.create_sheet("notes")
     book.save(path)
@@ -220,13 +239,13 @@ def test_trc(tmp_path):
     path = tmp_path / "walk.trc"
     path.write_text(TRC)
     found = hj.read_recording(path)
-    assert (
-        found.signals[:2] == ("R.ASIS.x", "R.ASIS.y") and found.unit("L.ASIS.z") == "mm"
-    )
+    assert found.signals[:2] == ("R.ASIS.x", "R.ASIS.y")
+    assert found.unit("L.ASIS.z") == "mm"
     np.testing.assert_array_equal(
         samples(found, "R.ASIS.x"), [[0, 0.01, 0.02], [1, 1.5, 2]]
     )
-    np.testing.assert_array_equal(samples(found, "L.ASIS.z"), [[0, 0.02], [6, 6.5]])
+    expected = [[0, 0.02], [6, 6.5]]
+    np.testing.assert_array_equal(samples(found, "L.ASIS.z"), expected)
     assert hj.read_recording(path, signals="L.ASIS").signals[0] == "L.ASIS.x"
     path.write_text(TRC.replace("100.00\t3", "100.00\t4"))
     refused("3 frames, its header 4", path)
@@ -242,7 +261,9 @@ def write_c3d(
 ):
     file = pytest.importorskip("ezc3d").c3d()
     points = np.ones((4, 2, len(SLOW)))
-    points[0, 0], points[1, 0], points[2, 1, 3] = X, 2 * X, np.nan
+    points[0, 0] = X
+    points[1, 0] = 2 * X
+    points[2, 1, 3] = np.nan
     file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
     file["parameters"]["POINT"]["LABELS"]["value"] = ("LASI", "LKnee")
     file["parameters"]["POINT"]["UNITS"]["value"] = ("mm",)
@@ -253,7 +274,9 @@ def write_c3d(
     file["parameters"]["ANALOG"]["RATE"]["value"] = [1000.0]
     file["parameters"]["ANALOG"]["LABELS"]["value"] = ("Fz1",)
     file["parameters"]["ANALOG"]["UNITS"]["value"] = ("N",)
-    file["data"]["analogs"] = np.append(F, np.zeros(10))[None, None]
+    no_samples = np.zeros(10)
+    force = np.append(F, no_samples)
+    file["data"]["analogs"] = force[None, None]
     for at, context, label in events:
         file.add_event([0, at], context, label)
     file.write(str(path))
@@ -269,13 +292,16 @@ def test_c3d(tmp_path):
     t, f = samples(found, "Fz1")
     np.testing.assert_allclose(t[:190], FAST, atol=1e-15)
     np.testing.assert_allclose(f[:190], F, atol=1e-6)
-    assert [found.unit(x) for x in ("LASI.y", "LKnee.x", "Fz1")] == ["mm", "deg", "N"]
-    assert len(samples(found, "LKnee.z")[0]) == len(SLOW) - 1
+    units = [found.unit(x) for x in ("LASI.y", "LKnee.x", "Fz1")]
+    assert units == ["mm", "deg", "N"]
+    times, _ = samples(found, "LKnee.z")
+    assert len(times) == len(SLOW) - 1
     np.testing.assert_allclose(
         found.trials[0].events["Left Strike"], [0.05, 0.1], atol=1e-7
     )
     analog = hj.read_recording(path, signals="Fz1")
-    assert analog.signals == ("Fz1",) and "Left Strike" in analog.trials[0].events
+    assert analog.signals == ("Fz1",)
+    assert "Left Strike" in analog.trials[0].events
     refused(
         "no signal 'EMG1'; it has LASI.x",
         path,
@@ -286,7 +312,8 @@ def test_c3d(tmp_path):
     refused("frames, its header 20", path)
     write_c3d(tmp_path / "late.c3d", first=10)
     found = hj.read_recording(tmp_path / "late.c3d")
-    np.testing.assert_allclose(found.trials[0].events["Left Strike"], [0.1], atol=1e-7)
+    strikes = found.trials[0].events["Left Strike"]
+    np.testing.assert_allclose(strikes, [0.1], atol=1e-7)
     assert found.findings[-1].text == (
         "1 events 'Left Strike' outside of the recording were left out."
     )
@@ -318,11 +345,15 @@ def write_bag(path, version):
     point = kinds["geometry_msgs/msg/Point"]
     stamped = kinds["geometry_msgs/msg/PointStamped"]
     layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
-    image = kinds["std_msgs/msg/UInt8MultiArray"](layout, np.zeros(1000, np.uint8))
+    zeros = np.zeros(1000, np.uint8)
+    image = kinds["std_msgs/msg/UInt8MultiArray"](layout, zeros)
     messages = []
     for t, x in zip(SLOW, X, strict=True):
-        head = header(stamp=time(5 + int(t), round(t % 1 * 1e9)), frame_id="", **seq)
-        messages.append((t, "/body", stamped(head, point(x, 2 * x, 0.0))))
+        seconds = 5 + int(t)
+        stamp = time(seconds, round(t % 1 * 1e9))
+        head = header(stamp=stamp, frame_id="", **seq)
+        body = point(x, 2 * x, 0.0)
+        messages.append((t, "/body", stamped(head, body)))
         messages.append((t, "/count", kinds["std_msgs/msg/Float64"](t)))
         messages.append((t, "/image", image))
     if is_1:
@@ -357,7 +388,8 @@ def test_bags(tmp_path, version):
     np.testing.assert_allclose(
         samples(found, "body.point.y"), [stamps, 2 * X], atol=1e-12
     )
-    np.testing.assert_allclose(samples(found, "count.data"), [SLOW, SLOW], atol=1e-12)
+    counted = samples(found, "count.data")
+    np.testing.assert_allclose(counted, [SLOW, SLOW], atol=1e-12)
     texts = [finding.text for finding in found.findings]
     assert any("times of count are those of arrival" in text for text in texts)
     assert "image.data.0" not in hj.read_recording(path).signals
@@ -398,12 +430,15 @@ def test_files_that_declare_more_than_they_hold(tmp_path, monkeypatch):
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file.create_dataset("time", shape=(10**10,), chunks=(1000,), dtype=float)
     refused("declares arrays of 80000000000 bytes", tmp_path / "x.h5")
-    zeros = {"time": np.zeros(2**17), "x": np.zeros(2**17)}
+    zero = np.zeros(2**17)
+    zeros = {"time": zero, "x": zero}
     write_v5(tmp_path / "x.mat", zeros, do_compression=True)
     monkeypatch.setattr(limits, "unpacked", lambda size: 100 * size)
     refused("declares arrays of 1048576 bytes or more", tmp_path / "x.mat")
     monkeypatch.setattr(limits, "RECORDED", 100)
-    parts = [hj.Recording(SLOW, {"x": X}), hj.Recording(FAST, {"f": F})]
+    slow = hj.Recording(SLOW, {"x": X})
+    fast = hj.Recording(FAST, {"f": F})
+    parts = [slow, fast]
     with pytest.raises(
         hj.errors.DefinitionError, match="2 signals at 191 times are too many"
     ):
@@ -436,10 +471,12 @@ def test_a_packed_struct_is_refused_before_it_takes_memory(tmp_path, monkeypatch
     empty[:] = [np.zeros(0)] * len(empty)
     write_v5(path, {"time": SLOW, "x": X, "c": empty}, do_compression=True)
     refused("declares arrays of .* or more", path)
-    few = {"c": np.array([1, "text", {"a": X}], object), "z": 1j * X, "on": X > 0}
+    mixed = np.array([1, "text", {"a": X}], object)
+    few = {"c": mixed, "z": 1j * X, "on": X > 0}
     sparse = {"s": eye_array(10**6, format="csc")}
     write_v5(path, {"time": SLOW, "x": X} | few | sparse, do_compression=True)
-    np.testing.assert_array_equal(samples(hj.read_recording(path), "x")[1], X)
+    recording = hj.read_recording(path)
+    np.testing.assert_array_equal(samples(recording, "x")[1], X)
     deep = {"time": SLOW, "x": X}
     for _ in range(limits.NESTED + 1):
         deep = {"g": deep}
@@ -471,7 +508,9 @@ def test_one_blank_does_not_fill_a_sheet(tmp_path, monkeypatch):
         written.clear()
         found = hj.read_recording(path)
         assert found.signals == expected.signals == ("x", "y")
-        np.testing.assert_array_equal(found.trials[0].values, expected.trials[0].values)
+        values = found.trials[0].values
+        expected_values = expected.trials[0].values
+        np.testing.assert_array_equal(values, expected_values)
 
 
 def test_columns_take_time_in_proportion_to_their_number(tmp_path):
@@ -491,10 +530,13 @@ def test_columns_take_time_in_proportion_to_their_number(tmp_path):
     for n in (200, 400):
         Name.compared = 0
         signals = {Name(f"x{k}"): X for k in range(n)}
-        parts = [hj.Recording(SLOW, signals), hj.Recording(SLOW, {"y": X})]
-        hj.Recording.join([hj.Recording.beside(parts)] * 2)
+        single = hj.Recording(SLOW, {"y": X})
+        parts = [hj.Recording(SLOW, signals), single]
+        trial = hj.Recording.beside(parts)
+        hj.Recording.join([trial] * 2)
         counts.append(Name.compared)
-    assert counts[1] < 3 * max(counts[0], 1)
+    allowed = 3 * max(counts[0], 1)
+    assert counts[1] < allowed
     groups = "/".join("g" * (limits.NESTED + 1))
     with h5py.File(tmp_path / "x.h5", "w") as file:
         file["time"], file[f"{groups}/x"] = SLOW, X
@@ -529,7 +571,8 @@ def test_attributes_of_netcdf_apply(tmp_path):
     """A scale, an offset and a mark of missing numbers, in a file of version 4 and of version 3."""
     h5py = pytest.importorskip("h5py")
     y = 4.0 + X
-    stored = np.round((y - 4.0) / 1e-4).astype(np.int32)
+    scaled = (y - 4.0) / 1e-4
+    stored = np.round(scaled).astype(np.int32)
     stored[3] = -32767
     y[3] = np.nan
     path = tmp_path / "new.nc"
@@ -560,7 +603,8 @@ def test_attributes_of_netcdf_apply(tmp_path):
 
 def test_texts_in_tables(tmp_path):
     """A row that begins with an error of a sheet, a column of text, and one byte of Latin-1."""
-    rows = [f"{x:.4f},{t:.3f},stance" for x, t in zip(X, SLOW, strict=True)]
+    pairs = zip(X, SLOW, strict=True)
+    rows = [f"{x:.4f},{t:.3f},stance" for x, t in pairs]
     rows[4] = f"#N/A,{SLOW[4]:.3f},stance"
     path = tmp_path / "walk.csv"
     head = b"# M\xfcller\n" + "Öffnung (°),time (s),phase\n".encode()
@@ -568,7 +612,8 @@ def test_texts_in_tables(tmp_path):
     found = hj.read_recording(path)
     assert found.signals == ("Öffnung",)
     assert found.units == ("°",)
-    assert np.flatnonzero(np.isnan(found["Öffnung"])) == [4]
+    missing = np.flatnonzero(np.isnan(found["Öffnung"]))
+    assert missing == [4]
     assert "text were left out: 'phase'" in repr(found)
     assert not hj.read_recording(path, signals="Öffnung").findings
     refused("'phase' holds 'stance'", path, signals="phase")
@@ -601,10 +646,12 @@ def test_mcap_with_a_hole(tmp_path):
     with rosbag2.Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
         topic = writer.add_connection("/force", kind, typestore=store)
         for k in range(200):
-            writer.write(topic, k * 10**7, store.serialize_cdr(number(1.0 * k), kind))
+            text = store.serialize_cdr(number(1.0 * k), kind)
+            writer.write(topic, k * 10**7, text)
     (path,) = (tmp_path / "bag").glob("*.mcap")
     data = bytearray(path.read_bytes())
     assert len(hj.read_recording(path).time) == 200
-    data[len(data) // 3 : len(data) // 3 + 300] = bytes(300)
+    first = len(data) // 3
+    data[first : first + 300] = bytes(300)
     path.write_bytes(data)
     refused("damaged: it has .* messages of 'force', its header 200", path)

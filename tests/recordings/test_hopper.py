@@ -29,9 +29,8 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
         hj.recordings.diagnose(*x).findings for x in zip(data, fits, strict=True)
     )
     said = "Outputs: yM and vM carry the same information at sections"
-    assert any(repr(w).startswith(said) for w in by_angle) and "199.94 cycles" in repr(
-        data[0]
-    )
+    assert any(repr(w).startswith(said) for w in by_angle)
+    assert "199.94 cycles" in repr(data[0])
     assert not any(w.cause == "outputs" for w in by_apex)
 
 
@@ -45,9 +44,14 @@ def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycl
     for recording in (clean, dirty):
         data.append(hj.recordings.sample_sections(recording, apex, **ABOUT))
         fits.append(hj.fit_series(data[-1], order=2))
-    changed = (clean.trials[0].values != dirty.trials[0].values).sum(axis=0)
-    assert np.abs(data[1].spikes - changed).max() <= 0.05 * max(changed) + 1
-    assert fits[1].standard_errors[0] < 2 * fits[0].standard_errors[0]
+    clean_values = clean.trials[0].values
+    differs = clean_values != dirty.trials[0].values
+    changed = differs.sum(axis=0)
+    missed = np.abs(data[1].spikes - changed)
+    assert missed.max() <= 0.05 * max(changed) + 1
+    error = fits[1].standard_errors[0]
+    usual = fits[0].standard_errors[0]
+    assert error < 2 * usual
     assert fits[1].contains(hopper_cycle.multipliers, 0.999).all()
     assert any(
         w.cause == "spikes" for w in hj.recordings.diagnose(data[1], fits[1]).findings
@@ -74,10 +78,14 @@ def test_responses_to_pushes(hopper_cycle, angle):
         k = np.arange(-N // 4, N // 4 + 1)
         m = 5
         r = 5 * N // 4
-        push = np.exp(-0.5 * (k / (N * found.width)) ** 2)
+        distance = k / (N * found.width)
+        push = np.exp(-0.5 * distance**2)
         area = push @ found.durations[(m + k) % N]
-        value = push @ model.impulse_response(4 * N)[(m + r) % N, r - k, :, 0] / area
-        np.testing.assert_allclose(theory[m, r, :, 0], value, rtol=1e-12)
+        response = model.impulse_response(4 * N)
+        answers = response[(m + r) % N, r - k, :, 0]
+        value = push @ answers / area
+        of_theory = theory[m, r, :, 0]
+        np.testing.assert_allclose(of_theory, value, rtol=1e-12)
         size = np.abs(theory).max(axis=(0, 1))
         assert (
             np.sqrt(np.mean((found.values - theory) ** 2, axis=(0, 1))) < most * size

@@ -16,7 +16,10 @@ RATE = 100
 
 def field(t, x, u=0.0):
     """x'' + 2 x' + (30 + 8 cos 2 pi t) x = u."""
-    return np.array([x[1], u - 2 * x[1] - (30 + 8 * np.cos(2 * np.pi * t)) * x[0]])
+    wave = np.cos(2 * np.pi * t)
+    stiffness = 30 + 8 * wave
+    acceleration = u - 2 * x[1] - stiffness * x[0]
+    return np.array([x[1], acceleration])
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +37,8 @@ def recording():
     n = 310 * RATE
     h = 1 / RATE
     r, w = (hj.experiments.random_input(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
-    e = np.array([0.002, 0.01])[:, None] * rng.normal(size=(2, n))
+    sizes = np.array([0.002, 0.01])[:, None]
+    e = sizes * rng.normal(size=(2, n))
     x = np.zeros(2)
     y = np.zeros((2, n))
     u = np.zeros(n)
@@ -42,8 +46,11 @@ def recording():
         y[:, i] = x + e[:, i]
         u[i] = r[i] - 4 * y[0, i] - y[1, i]
         for t in (i * h, i * h + h / 2):  # two steps of the midpoint rule
-            middle = x + h / 4 * field(t, x, u[i] + 0.2 * w[i])
-            x = x + h / 2 * field(t + h / 4, middle, u[i] + 0.2 * w[i])
+            force = u[i] + 0.2 * w[i]
+            slope = field(t, x, force)
+            middle = x + h / 4 * slope
+            half_later = t + h / 4
+            x = x + h / 2 * field(half_later, middle, u[i] + 0.2 * w[i])
     t = np.arange(n) * h
     clock = np.cos(2 * np.pi * t)
     signals = {"time": t, "clock": clock, "u": u, "r": r, "x": y[0] + clock, "v": y[1]}
@@ -59,7 +66,8 @@ def test_the_plant_is_found_from_a_file(recording, multipliers, tmp_path):
         "--inputs u --references r --outputs x,v --crossing clock:rising --sections 16"
     )
     with pytest.warns(FindingWarning):
-        assert not main(["identify", trial, *options.split(), "--out", out])
+        arguments = ["identify", trial, *options.split(), "--out", out]
+        assert not main(arguments)
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
     assert summary["references"] == ["r"]
     assert "u" in summary["inputs"]

@@ -33,11 +33,16 @@ def made_up(seed, force=0.1, noise=1e-3):
         f = hj.experiments.random_input(
             STRIDES, RATE, 6, rms=force, seed=100 * seed + k
         )[:, 0]
-        w = signal.lfilter([0, 1 / RATE], [1, -np.exp(-0.3 / RATE)], f)
+        decay = np.exp(-0.3 / RATE)
+        w = signal.lfilter([0, 1 / RATE], [1, -decay], f)
         angle = 2 * np.pi * time
-        x = 2.0 + np.cos(angle) + w + noise * rng.normal(size=len(f))
-        v = -6 * np.sin(angle) + 4 * w * np.cos(angle) + noise * rng.normal(size=len(f))
-        trials.append(hj.Recording(time, {"f": f, "x": x, "v": v}, name=f"trial {k}"))
+        noise_x = noise * rng.normal(size=len(f))
+        x = 2.0 + np.cos(angle) + w + noise_x
+        forced = 4 * w * np.cos(angle)
+        swing = -6 * np.sin(angle) + forced
+        v = swing + noise * rng.normal(size=len(f))
+        signals = {"f": f, "x": x, "v": v}
+        trials.append(hj.Recording(time, signals, name=f"trial {k}"))
     return hj.Recording.join(trials).mark("top", TOP, bandwidth=16)
 
 
@@ -168,11 +173,11 @@ def test_an_order_that_is_too_low_is_named():
         )
         untried = hj.identify_recording(twice, TOP, **names)
     told = Counter(str(x.message) for x in seen)
-    assert set(told.values()) == {1} and set(told) >= {
-        repr(x) for x in untried.findings
-    }
+    assert set(told.values()) == {1}
+    assert set(told) >= {repr(x) for x in untried.findings}
     assert max(map(len, "\n".join(map(str, untried.findings)).split("\n"))) <= 100
-    constant = mishandle(twice, signals("y0", lambda x, s: 0 * x + 1), **NAMES)
+    replaced = signals("y0", lambda x, s: 0 * x + 1)
+    constant = mishandle(twice, replaced, **NAMES)
     with pytest.raises(
         hj.errors.DefinitionError,
         match="no trial has samples of all .*x does not change",
@@ -202,7 +207,8 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
     names = {"inputs": "u", "outputs": ("yM", "vM"), "n_sections": 16, "order": 2}
     result = hj.identify_recording(made, APEX, **names)
     validation = result.held_out.validation
-    assert validation.independent and validation.fit.min() > 99
+    assert validation.independent
+    assert validation.fit.min() > 99
     for fit, named in (99.3, False), (70.0, True):
         tests = np.full(2, fit), np.zeros(2), np.full(2, float(named))
         worse = eqx.tree_at(
@@ -218,7 +224,8 @@ def test_residuals_that_depend_on_the_input_are_named_if_they_are_large(hopper_c
         lambda x: x.diagnosis.expected, result, result.diagnosis.expected.copy()
     )
     few.diagnosis.expected[0] = np.inf
-    assert "<td>300</td>" in _page(few, {}) and "<td>inf" not in _page(few, {})
+    assert "<td>300</td>" in _page(few, {})
+    assert "<td>inf" not in _page(few, {})
 
 
 APEX = hj.Crossing("vM", "falling")
@@ -254,7 +261,8 @@ def test_coarse_stamps_are_named_and_lost_samples_are_not():
     values = {"f": trial.values[:, 0], "x": trial.values[:, 1], "v": trial.values[:, 2]}
 
     def named(time, kept):
-        recording = hj.Recording(time[kept], {k: x[kept] for k, x in values.items()})
+        signals = {k: x[kept] for k, x in values.items()}
+        recording = hj.Recording(time[kept], signals)
         found = hj.recordings.check_recording(
             recording, inputs="f", outputs=("x", "v")
         ).findings
@@ -263,7 +271,9 @@ def test_coarse_stamps_are_named_and_lost_samples_are_not():
     every = np.ones(len(trial.time), bool)
     coarse = np.round(trial.time / 0.007) * 0.007
     assert named(coarse, every) == {"coarse time stamps"}
-    lost = np.random.default_rng(0).random(len(trial.time)) < 1 / 3
+    rng = np.random.default_rng(0)
+    drawn = rng.random(len(trial.time))
+    lost = drawn < 1 / 3
     assert named(trial.time, every) == set()
     assert "coarse time stamps" not in named(trial.time, ~lost)
 
@@ -275,7 +285,9 @@ def test_strikes_of_both_sides_are_named(late):
     trials = []
     for trial in recording.trials:
         at = trial.events["top"]
-        other = (at[1:] + at[:-1]) / 2 + late
+        pairs = at[1:] + at[:-1]
+        middles = pairs / 2
+        other = middles + late
         steps = np.sort(np.concatenate([at, other]))
         events = {"step": steps, "top": at}
         trials.append(eqx.tree_at(lambda t: t.events, trial, events))
@@ -291,8 +303,11 @@ def test_a_trial_that_runs_backwards_is_named():
     for k, trial in enumerate(made_up(0).trials):
         angle = 2 * np.pi * trial.time
         f, x, v = trial.values.T
-        x = x + 0.9 * np.sin(2 * angle) + 0.6 * np.sin(3 * angle)
-        order = slice(None, None, -1) if k == 1 else slice(None)
+        second = 0.9 * np.sin(2 * angle)
+        third = 0.6 * np.sin(3 * angle)
+        x = x + second + third
+        backwards = slice(None, None, -1)
+        order = backwards if k == 1 else slice(None)
         signals = {"f": f[order], "x": x[order], "v": v[order]}
         trials.append(hj.Recording(trial.time, signals, name=f"trial {k}"))
     (found,) = [
@@ -307,8 +322,10 @@ def test_a_trial_that_runs_backwards_is_named():
 @pytest.mark.parametrize("width", [0.001, 0.003, 0.01])
 def test_a_short_trigger_defines_the_phase(width):
     time = np.arange(0, 40, 0.001)
-    strikes = np.cumsum(np.random.default_rng(0).uniform(0.9, 1.1, size=37)) + 0.5
-    since = time - strikes[np.searchsorted(strikes, time) - 1]
+    rng = np.random.default_rng(0)
+    strikes = np.cumsum(rng.uniform(0.9, 1.1, size=37)) + 0.5
+    last = np.searchsorted(strikes, time) - 1
+    since = time - strikes[last]
     pulse = 5.0 * ((since >= 0) & (since < width))
     recording = hj.Recording(time, {"trigger": pulse, "x": np.sin(time)})
     crossing = hj.Crossing("trigger", "rising", 2.5)
@@ -325,6 +342,8 @@ def test_the_advice_for_a_clock_that_wraps_undoes_it():
     wrapped = np.mod(time + 7.0, 32.768)
     with pytest.raises(hj.errors.DefinitionError, match="numpy.unwrap") as error:
         hj.Recording(wrapped, {"x": time})
-    period = float(str(error.value).split("period=")[1].split(")")[0])
-    undone = hj.Recording(np.unwrap(wrapped, period=period), {"x": time})
+    after = str(error.value).split("period=")[1]
+    period = float(after.split(")")[0])
+    unwrapped = np.unwrap(wrapped, period=period)
+    undone = hj.Recording(unwrapped, {"x": time})
     np.testing.assert_allclose(undone.time, time + 7.0, atol=1e-6)

@@ -31,8 +31,10 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
     sense = -1 if turned else 1
     x_noise = noise * rng.normal(size=t.size)
     v_noise = noise * rng.normal(size=t.size)
-    x = 3 + 2 * (np.cos(2 * np.pi * t) + x_noise)
-    v = 5 * (sense * np.sin(2 * np.pi * t) + v_noise)
+    cosine = np.cos(2 * np.pi * t)
+    x = 3 + 2 * (cosine + x_noise)
+    sine = np.sin(2 * np.pi * t)
+    v = 5 * (sense * sine + v_noise)
     gap = (t > 5.2) & (t < 7.1)
     x[gap] = np.nan
     recording = hj.Recording(t, {"x": x, "v": v})
@@ -41,7 +43,8 @@ def test_noise_gaps_and_irregular_samples(seed, noise, turned):
     before, after = windings
     for k, winding in enumerate((before, after)):
         times = times_of_section_0(phase, k)
-        error = np.abs(times - np.round(times)).max()
+        fractions = times - np.round(times)
+        error = np.abs(fractions).max()
         assert error < 0.02 + noise / 2
         assert (np.diff(winding.time) > 0).all()
         assert (np.diff(winding.phase) > 0).all()
@@ -65,14 +68,16 @@ def test_a_crossing_as_the_anchor(crossing, time, wave):
     """Section 0 lies at the angle at which the signal crosses the level."""
     family = dataclasses.replace(CIRCLE, anchor=crossing)
     phase = hj.recordings.estimate_phase(wave, family)
-    assert_allclose(times_of_section_0(phase)[1:-1] % 1, time, atol=1e-3)
+    times = times_of_section_0(phase)[1:-1]
+    assert_allclose(times % 1, time, atol=1e-3)
 
 
 def test_a_signal_that_crosses_at_several_angles_is_no_anchor(wave):
     (trial,) = wave.trials
     _, x, v = trial.values.T
     thrice = np.cos(6 * np.pi * trial.time)
-    recording = hj.Recording(trial.time, {"x": x, "v": v, "w": thrice})
+    signals = {"x": x, "v": v, "w": thrice}
+    recording = hj.Recording(trial.time, signals)
     family = dataclasses.replace(CIRCLE, anchor=hj.Crossing("w", "falling"))
     with pytest.raises(
         hj.errors.DefinitionError, match="w falling, .* all around the cycle"
@@ -83,7 +88,8 @@ def test_a_signal_that_crosses_at_several_angles_is_no_anchor(wave):
 def recording_of(events):
     """A recording of a minute with these events."""
     t = np.arange(0, 61, 0.5)
-    return hj.Recording(t, {"x": np.zeros(len(t))}, events={"e": events})
+    none = np.zeros(len(t))
+    return hj.Recording(t, {"x": none}, events={"e": events})
 
 
 @settings(max_examples=15)
@@ -91,21 +97,27 @@ def recording_of(events):
 def test_irregular_events(seed, jitter):
     """Jitter, missed and doubled events: the phase grows, is right at the events, or nearly so."""
     rng = np.random.default_rng(seed)
-    t = np.arange(0.3, 60) + jitter * rng.uniform(-1, 1, 60)
+    late = jitter * rng.uniform(-1, 1, 60)
+    t = np.arange(0.3, 60) + late
     missed = 10 + rng.permutation(20)[0]
     doubled = 40 + rng.permutation(10)[0]
     seen = np.delete(t, missed)
-    events = np.sort(np.append(seen, t[doubled] + 0.1))
-    phase = hj.recordings.estimate_phase(recording_of(events), hj.AtEvent("e"))
+    twice = t[doubled] + 0.1
+    events = np.sort(np.append(seen, twice))
+    recording = recording_of(events)
+    phase = hj.recordings.estimate_phase(recording, hj.AtEvent("e"))
     assert phase.dropped == 1
     assert phase.missed == 2
-    assert phase.period == pytest.approx(1, abs=2 * jitter + 1e-9)
+    allowed = 2 * jitter + 1e-9
+    assert phase.period == pytest.approx(1, abs=allowed)
     (windings,) = phase.stretches
     assert len(windings) == 2
     for winding in windings:
         assert (np.diff(winding.phase) > 0).all()
         assert (np.diff(winding.time) > 0).all()
-        inside = t[(t >= winding.time[0]) & (t <= winding.time[-1])]
+        begun = t >= winding.time[0]
+        not_ended = t <= winding.time[-1]
+        inside = t[begun & not_ended]
         at_events = np.interp(inside, winding.time, winding.phase)
         counted = at_events[0] + np.arange(len(inside))
         assert_allclose(at_events, counted, rtol=0, atol=1e-9)
@@ -113,7 +125,10 @@ def test_irregular_events(seed, jitter):
 
 def test_what_is_no_phase(wave):
     t = wave.trials[0].time
-    still = hj.Recording(t, {"x": np.cos(t) + 5, "v": np.sin(t) + 5, "c": 0 * t})
+    x = np.cos(t) + 5
+    v = np.sin(t) + 5
+    signals = {"x": x, "v": v, "c": 0 * t}
+    still = hj.Recording(t, signals)
     for definition, message in [
         (
             dataclasses.replace(CIRCLE, center=(0, 0), scale=(1, 1)),
@@ -136,7 +151,8 @@ def test_what_is_no_phase(wave):
 
 def test_events_without_jitter():
     t = 0.3 + np.arange(60)
-    recording = hj.Recording(t, {"x": t}, events={"e": 0.3 + np.arange(15)})
+    events = 0.3 + np.arange(15)
+    recording = hj.Recording(t, {"x": t}, events={"e": events})
     hj.recordings.estimate_phase(recording, hj.AtEvent("e")).plot()
 
 
@@ -155,8 +171,11 @@ def test_splines_are_those_of_scipy(seed, n, bandwidth):
     y = rng.normal(size=n)
     x = np.linspace(t[0], t[-1], 200)
     step = np.median(np.diff(t))
-    penalty = (2 * np.pi * bandwidth * step) ** -4
+    cutoff = 2 * np.pi * bandwidth * step
+    penalty = cutoff**-4
     smooth = make_smoothing_spline(t / step, y, lam=penalty)
-    assert_allclose(spline(t, y, bandwidth)(x), smooth(x / step), atol=1e-9)
+    found = spline(t, y, bandwidth)(x)
+    assert_allclose(found, smooth(x / step), atol=1e-9)
     through = CubicSpline(t, y, bc_type="natural")
-    assert_allclose(spline(t, y, np.inf)(x), through(x), atol=1e-9)
+    found_through = spline(t, y, np.inf)(x)
+    assert_allclose(found_through, through(x), atol=1e-9)

@@ -34,23 +34,31 @@ class Fit(MultiplierEstimate):
 def fit_of(c, scale=1e-4, outputs=("y",)):
     c = np.asarray(c, float)
     roots = np.roots([1.0, *c])
-    roots = roots[np.argsort(-np.abs(roots))].astype(complex)
-    return Fit(roots, c, scale * np.eye(len(c)), np.inf, outputs)
+    order = np.argsort(-np.abs(roots))
+    roots = roots[order].astype(complex)
+    covariance = scale * np.eye(len(c))
+    return Fit(roots, c, covariance, np.inf, outputs)
 
 
 def study(y, error, **columns):
     columns = {name: list(column) for name, column in columns.items()}
-    table = {"subject": [f"s{i}" for i in range(len(y))]} | columns
+    names = [f"s{i}" for i in range(len(y))]
+    table = {"subject": names} | columns
     return Population(table, {"gain": y}, {"gain": error}, {"gain": "m/N"})
 
 
 def test_equal_errors_give_the_t_interval():
     """Hartung and Knapp's interval is then Student's, and the spread what errors leave."""
     y = RNG.normal(size=N)
-    row = study(y, np.full(N, 0.3)).mean("gain")
-    interval = stats.t.interval(0.95, N - 1, y.mean(), stats.sem(y))
-    assert (row["low"][0], row["high"][0]) == pytest.approx(interval)
-    assert row["spread"][0] == pytest.approx(np.sqrt(y.var(ddof=1) - 0.09))
+    people = study(y, np.full(N, 0.3))
+    row = people.mean("gain")
+    error_of_mean = stats.sem(y)
+    interval = stats.t.interval(0.95, N - 1, y.mean(), error_of_mean)
+    found = (row["low"][0], row["high"][0])
+    assert found == pytest.approx(interval)
+    left = y.var(ddof=1) - 0.09
+    expected = np.sqrt(left)
+    assert row["spread"][0] == pytest.approx(expected)
 
 
 def test_an_outlier_among_subjects_is_named():
@@ -62,11 +70,11 @@ def test_an_outlier_among_subjects_is_named():
 
 
 def test_equal_estimates_have_the_error_of_their_fits():
-    row = study(np.ones(N), np.full(N, 0.3)).mean("gain")
-    assert (
-        row["standard_error"][0] == pytest.approx(0.3 / np.sqrt(N))
-        and row["spread"][0] == 0
-    )
+    errors = np.full(N, 0.3)
+    row = study(np.ones(N), errors).mean("gain")
+    expected = 0.3 / np.sqrt(N)
+    assert row["standard_error"][0] == pytest.approx(expected)
+    assert row["spread"][0] == 0
 
 
 def test_the_bcg_trials():
@@ -102,10 +110,13 @@ def test_the_bcg_trials():
         0.5325,
         0.0714,
     ]
-    row = study(np.array(y), np.sqrt(v)).mean("gain")
-    assert row["estimate"][0] == pytest.approx(-0.7145, abs=2e-4)
+    errors = np.sqrt(v)
+    row = study(np.array(y), errors).mean("gain")
+    estimate = row["estimate"][0]
+    assert estimate == pytest.approx(-0.7145, abs=2e-4)
     assert row["standard_error"][0] == pytest.approx(0.1808, abs=2e-4)
-    assert row["spread"][0] ** 2 == pytest.approx(0.3132, abs=2e-4)
+    variance = row["spread"][0] ** 2
+    assert variance == pytest.approx(0.3132, abs=2e-4)
     assert (row["spread_low"][0], row["spread_high"][0]) == pytest.approx(
         (0.346, 1.0543), abs=2e-4
     )
@@ -118,11 +129,15 @@ def test_complete_pairs_give_the_paired_t_test():
     y = np.concatenate([first, second])
     error = np.full(2 * N, 0.01)
     labels = np.repeat(["a", "b"], N)
-    table = {"subject": np.tile(np.arange(N), 2), "condition": labels}
-    row = Population(table, {"q": y}, {"q": error}).difference("q", "a", "b")
+    names = np.tile(np.arange(N), 2)
+    table = {"subject": names, "condition": labels}
+    people = Population(table, {"q": y}, {"q": error})
+    row = people.difference("q", "a", "b")
     paired = stats.ttest_rel(first, second)
-    assert row["p"][0] == pytest.approx(paired.pvalue, rel=1e-3)
-    assert row["dof"][0] == pytest.approx(N - 1, rel=1e-3)
+    p_value = row["p"][0]
+    assert p_value == pytest.approx(paired.pvalue, rel=1e-3)
+    dof = row["dof"][0]
+    assert dof == pytest.approx(N - 1, rel=1e-3)
 
     wide = 3 * second
     y = np.concatenate([first, wide])
@@ -131,12 +146,15 @@ def test_complete_pairs_give_the_paired_t_test():
     difference = first.mean() - wide.mean()
     expected = abs(difference / welch.statistic)
     assert row["standard_error"][0] == pytest.approx(expected, rel=1e-3)
-    assert row["dof"][0] == pytest.approx(welch.df, rel=0.02)
+    dof_of_groups = row["dof"][0]
+    assert dof_of_groups == pytest.approx(welch.df, rel=0.02)
 
 
 def test_the_mixed_model_maximizes_the_restricted_likelihood():
     """That of all contrasts without a mean, for errors that differ and missing conditions."""
-    y = RNG.normal(size=(8, 2)) + RNG.normal(size=(8, 1))
+    of_condition = RNG.normal(size=(8, 2))
+    of_subject = RNG.normal(size=(8, 1))
+    y = of_condition + of_subject
     v = RNG.uniform(0.02, 0.2, (8, 2))
     present = np.ones((8, 2), bool)
     present[0, 0] = present[1, 1] = False
@@ -149,7 +167,8 @@ def test_the_mixed_model_maximizes_the_restricted_likelihood():
     contrasts = linalg.null_space(x.T)
 
     def covariance(between):
-        return same * between[np.ix_(cells, cells)] + np.diag(v)
+        of_cells = between[np.ix_(cells, cells)]
+        return same * of_cells + np.diag(v)
 
     def likelihood(between):
         part = contrasts.T @ covariance(between) @ contrasts
@@ -164,19 +183,26 @@ def test_the_mixed_model_maximizes_the_restricted_likelihood():
     np.testing.assert_allclose(
         fit.coefficients, np.linalg.solve(x.T @ w @ x, x.T @ w @ y)
     )
-    assert (np.linalg.eigvalsh(fit.covariance - fit.plain) > -1e-12).all()
+    added = np.linalg.eigvalsh(fit.covariance - fit.plain)
+    assert (added > -1e-12).all()
 
 
 def test_predictions_shrink_and_covariates_explain():
     age = np.linspace(20, 60, N)
     error = RNG.uniform(0.1, 0.4, N)
-    people = study(0.1 * age + 0.01 * RNG.normal(size=N), error, age=age)
+    noise = 0.01 * RNG.normal(size=N)
+    people = study(0.1 * age + noise, error, age=age)
     row = people.mean("gain", covariates="age")
     assert list(row["effect"]) == ["mean", "slope of age"]
-    assert row["estimate"][1] == pytest.approx(0.1, abs=0.01) and row["p"][1] < 1e-4
-    flat = study(5 + error * RNG.normal(size=N), error).predictions("gain")
-    mean = study(flat["estimate"], error).mean("gain")["estimate"][0]
-    assert (np.abs(flat["prediction"] - mean) <= np.abs(flat["estimate"] - mean)).all()
+    assert row["estimate"][1] == pytest.approx(0.1, abs=0.01)
+    assert row["p"][1] < 1e-4
+    level = 5 + error * RNG.normal(size=N)
+    flat = study(level, error).predictions("gain")
+    overall = study(flat["estimate"], error).mean("gain")
+    mean = overall["estimate"][0]
+    predicted = np.abs(flat["prediction"] - mean)
+    estimated = np.abs(flat["estimate"] - mean)
+    assert (predicted <= estimated).all()
 
 
 def test_moderated_variances_are_closer_to_the_true_ones():
@@ -184,21 +210,30 @@ def test_moderated_variances_are_closer_to_the_true_ones():
     dof = np.full(400, 6.0)
     true = 1 / strides
     v = true * RNG.chisquare(6, 400) / 6
-    trend = np.column_stack([np.ones(400), np.log(strides)])
+    ones = np.ones(400)
+    trend = np.column_stack([ones, np.log(strides)])
     better = moderated(v, dof, trend)
-    assert np.std(np.log(better / true)) < 0.2 * np.std(np.log(v / true))
-    assert abs(np.log(better / true).mean()) < 0.1
-    np.testing.assert_array_equal(moderated(v, np.full(400, np.inf), trend), v)
+    moderated_error = np.std(np.log(better / true))
+    plain_error = np.std(np.log(v / true))
+    assert moderated_error < 0.2 * plain_error
+    bias = abs(np.log(better / true).mean())
+    assert bias < 0.1
+    infinite = np.full(400, np.inf)
+    np.testing.assert_array_equal(moderated(v, infinite, trend), v)
 
 
 def test_quantities_of_fits():
     """The modulus of a pair is the root of c2, whose error is known; orders may differ."""
     fits = [fit_of([0.5, 0.5 + 0.01 * k]) for k in range(4)]
-    people = Population.from_fits([*fits, fit_of([0.5])], {"subject": list("abcde")})
+    all_fits = [*fits, fit_of([0.5])]
+    people = Population.from_fits(all_fits, {"subject": list("abcde")})
     modulus = np.sqrt([0.5, 0.51, 0.52, 0.53])
-    np.testing.assert_allclose(people.values["modulus"], [*modulus, 0.5])
-    np.testing.assert_allclose(people.errors["modulus"], [*1e-2 / (2 * modulus), 1e-2])
-    np.testing.assert_allclose(np.cos(people.values["angle"][:4]), -0.25 / modulus)
+    found_moduli = people.values["modulus"]
+    np.testing.assert_allclose(found_moduli, [*modulus, 0.5])
+    expected = [*1e-2 / (2 * modulus), 1e-2]
+    np.testing.assert_allclose(people.errors["modulus"], expected)
+    cosines = np.cos(people.values["angle"][:4])
+    np.testing.assert_allclose(cosines, -0.25 / modulus)
     assert [people.mean(name)["subjects"][0] for name in ("angle", "c1", "c2")] == [
         4,
         5,
@@ -208,54 +243,76 @@ def test_quantities_of_fits():
 
 def test_plans_agree_with_closed_forms():
     y = 1 + 0.2 * RNG.normal(size=12)
-    people = study(y, np.full(12, 0.1), strides=np.full(12, 100))
+    errors = np.full(12, 0.1)
+    people = study(y, errors, strides=np.full(12, 100))
     with pytest.raises(
         hj.errors.DefinitionError, match="subjects differ in 'gain' by no more than"
     ):
-        study(y, np.ones(12), strides=np.full(12, 100)).allocation("gain")
+        strides = np.full(12, 100)
+        few = study(y, np.ones(12), strides=strides)
+        few.allocation("gain")
     between = np.sqrt(y.var(ddof=1) - 0.01)
     plan = people.allocation("gain", subject_cost=4, trial_cost=1e-9, stride_cost=0.01)
-    assert plan["strides"][0] == pytest.approx(np.sqrt(400) / between, rel=1e-4)
+    expected_strides = np.sqrt(400) / between
+    assert plan["strides"][0] == pytest.approx(expected_strides, rel=1e-4)
     spread = np.sqrt(between**2 + 0.01)
     (power,) = people.power("gain", 0.25, (12,), draws=40)["power"]
     expected = stats.nct.sf(
         stats.t.isf(0.025, 22), 22, 0.25 / (spread * np.sqrt(2 / 12))
     )
-    assert abs(power - expected) < 3 * np.sqrt(expected * (1 - expected) / 40)
+    variance = expected * (1 - expected)
+    allowed = 3 * np.sqrt(variance / 40)
+    assert abs(power - expected) < allowed
 
 
 def test_trials_and_strides_have_the_smallest_variance_for_their_cost():
-    y = np.repeat(RNG.normal(size=12), 3) + 0.8 * RNG.normal(size=36)
-    table = {"subject": np.repeat(np.arange(12), 3), "strides": np.full(36, 100)}
-    people = Population(table, {"gain": y}, {"gain": np.full(36, 0.1)})
-    wide = study([1.0, 2], [1.0, 1], condition=["a" * 60, "b" * 60])
+    of_subject = np.repeat(RNG.normal(size=12), 3)
+    y = of_subject + 0.8 * RNG.normal(size=36)
+    names = np.repeat(np.arange(12), 3)
+    table = {"subject": names, "strides": np.full(36, 100)}
+    errors = np.full(36, 0.1)
+    people = Population(table, {"gain": y}, {"gain": errors})
+    conditions = ["a" * 60, "b" * 60]
+    wide = study([1.0, 2], [1.0, 1], condition=conditions)
     assert max(map(len, repr(wide).splitlines())) <= 100
     row = people.allocation(
         "gain", subject_cost=4, trial_cost=0.5, stride_cost=0.01
     ).iloc[0]
     y = y.reshape(12, 3)
     trials = y.var(axis=1, ddof=1).mean() - 0.01
-    subjects = y.mean(axis=1).var(ddof=1) - (trials + 0.01) / 3
+    between_means = y.mean(axis=1).var(ddof=1)
+    subjects = between_means - (trials + 0.01) / 3
     assert row["trial_spread"] ** 2 == pytest.approx(trials)
     assert row["subject_spread"] ** 2 == pytest.approx(subjects, rel=1e-4)
-    k, m = np.meshgrid(np.arange(1, 30), np.arange(1, 400))
-    product = (subjects + trials / k + 1 / (k * m)) * (4 + 0.5 * k + 0.01 * k * m)
+    trial_counts = np.arange(1, 30)
+    stride_counts = np.arange(1, 400)
+    k, m = np.meshgrid(trial_counts, stride_counts)
+    by_stride = 1 / (k * m)
+    spread = subjects + trials / k + by_stride
+    cost = 4 + 0.5 * k + 0.01 * k * m
+    product = spread * cost
     best = np.unravel_index(product.argmin(), product.shape)
-    assert (row["trials"], round(row["strides"])) == (k[best], m[best])
+    found = (row["trials"], round(row["strides"]))
+    assert found == (k[best], m[best])
 
 
 METERS, MICROMETERS = ((Signal("y", unit),) for unit in ("m", "um"))
-AXES = {"phase": np.arange(6) / 6, "lag": np.arange(8.0)}
+PHASES = np.arange(6) / 6
+AXES = {"phase": PHASES, "lag": np.arange(8.0)}
 
 
 def maps_of(values, n, **labels):
-    table = {"subject": np.tile(np.arange(n), len(values) // n)} | labels
+    repeats = len(values) // n
+    subjects = np.tile(np.arange(n), repeats)
+    table = {"subject": subjects} | labels
     return PopulationMaps(table, values, AXES)
 
 
 def test_all_sign_flips_give_the_exact_p_value():
     y = RNG.normal(size=(7, 6, 8))
-    both = maps_of(np.concatenate([y, 0 * y]), 7, condition=np.repeat(["a", "b"], 7))
+    conditions = np.repeat(["a", "b"], 7)
+    values = np.concatenate([y, 0 * y])
+    both = maps_of(values, 7, condition=conditions)
     test = both.difference("a", "b")
     largest = [
         np.abs(stats.ttest_1samp(np.array(s)[:, None, None] * y, 0).statistic).max()
@@ -263,7 +320,9 @@ def test_all_sign_flips_give_the_exact_p_value():
     ]
     t = stats.ttest_1samp(y, 0).statistic
     np.testing.assert_allclose(test.t, t)
-    expected = (np.array(largest)[:, None, None] >= np.abs(t) * (1 - 1e-9)).mean(axis=0)
+    observed = np.abs(t) * (1 - 1e-9)
+    largest_of_draws = np.array(largest)[:, None, None]
+    expected = (largest_of_draws >= observed).mean(axis=0)
     np.testing.assert_allclose(test.p, expected)
     assert "all 64 sign flips" in test.methods
 
@@ -274,17 +333,20 @@ def test_groups_are_compared_by_the_statistic_of_welch():
     groups = ["a"] * 5 + ["b"] * 7
     test = maps_of(y, 12, group=groups).difference("a", "b", draws=2000)
     assert "2000 random rotations" in test.methods
-    assert test.significant[[0, 5], 2:5].all()
+    inside = test.significant[[0, 5], 2:5]
+    assert inside.all()
     np.testing.assert_array_equal(test.significant, test.p <= 0.05)
     welch = stats.ttest_ind(y[:5], y[5:], equal_var=False)
     np.testing.assert_allclose(test.t, welch.statistic)
-    turned = maps_of(y * np.exp(1j), 12, group=groups).difference("a", "b", draws=100)
+    rotated = maps_of(y * np.exp(1j), 12, group=groups)
+    turned = rotated.difference("a", "b", draws=100)
     np.testing.assert_allclose(turned.t, np.abs(test.t))
 
 
 def smooth(rng, n):
     """Normal curves of n subjects at 24 points, correlated over four of them."""
-    kernel = np.exp(-0.5 * (np.arange(-8, 9) / 4) ** 2)
+    distance = np.arange(-8, 9) / 4
+    kernel = np.exp(-0.5 * distance**2)
     kernel /= np.linalg.norm(kernel)
     rows = rng.normal(size=(n, 24 + 16))
     return np.array([np.convolve(row, kernel, "valid") for row in rows])
@@ -293,12 +355,14 @@ def smooth(rng, n):
 def test_groups_of_other_sizes_and_spreads_raise_no_alarm():
     """Of 120 pairs of equal means 5 % differ. (By permutations of labels 36 %.)"""
     rng = np.random.default_rng(0)
-    table = {"subject": np.arange(20), "group": ["a"] * 6 + ["b"] * 14}
+    groups = ["a"] * 6 + ["b"] * 14
+    table = {"subject": np.arange(20), "group": groups}
     alarms = 0
     for _ in range(120):
         y = smooth(rng, 20)
         y[:6] *= 2.0
-        maps = PopulationMaps(table, y, {"phase": np.arange(24) / 24})
+        phases = np.arange(24) / 24
+        maps = PopulationMaps(table, y, {"phase": phases})
         alarms += maps.difference("a", "b", draws=200).significant.any()
     assert stats.binomtest(alarms, 120, 0.05).pvalue > 0.01
 
@@ -314,12 +378,14 @@ def test_bands_of_skewed_values_hold(groups):
         true = np.exp(0.5)
         if groups:
             y[:7] *= 2.0
-        maps = PopulationMaps(table, y, {"phase": np.arange(24) / 24})
+        phases_of_maps = np.arange(24) / 24
+        maps = PopulationMaps(table, y, {"phase": phases_of_maps})
         if groups:
             found = maps.difference("a", "b", draws=300)
         else:
             found = maps.mean(draws=300)
-        held += (np.abs(found.values - true) <= found.reach).all()
+        apart = np.abs(found.values - true)
+        held += (apart <= found.reach).all()
         assert "values are skewed" in found.methods
     assert stats.binomtest(held, 100, 0.95).pvalue > 0.01
 
@@ -328,7 +394,8 @@ def test_the_band_holds_the_mean_and_draws_repeat():
     y = RNG.normal(size=(15, 6, 8))
     first, second = (maps_of(y, 15).mean(draws=500, seed=1) for _ in range(2))
     np.testing.assert_array_equal(first.reach, second.reach)
-    assert (first.reach > 1.2 * stats.t.isf(0.025, 14) * stats.sem(y)).all()
+    error = stats.sem(y)
+    assert (first.reach > 1.2 * stats.t.isf(0.025, 14) * error).all()
 
 
 @pytest.mark.parametrize(
@@ -367,7 +434,8 @@ def test_refusals(sentence, call):
 
 
 def fitted(*fits):
-    return Population.from_fits(fits, {"subject": list("ab")[: len(fits)]})
+    subjects = list("ab")[: len(fits)]
+    return Population.from_fits(fits, {"subject": subjects})
 
 
 @pytest.mark.slow
@@ -436,7 +504,8 @@ def write_numbers(folder, result, formats):
     assert result.fit.result == Result.OK
     (folder / "report.html").write_text("")
     odd = (Finding("order", "odd."),)
-    hj.save(folder / "fit.npz", dataclasses.replace(result.fit, findings=odd))
+    odd_fit = dataclasses.replace(result.fit, findings=odd)
+    hj.save(folder / "fit.npz", odd_fit)
     (folder / "summary.json").write_text(json.dumps(summarize(result)))
 
 
@@ -445,7 +514,8 @@ def test_figures():
     condition = np.repeat(["a", "b"], N)
     table = {"subject": subject, "condition": condition}
     values = RNG.normal(size=2 * N)
-    people = Population(table, {"q": values}, {"q": np.ones(2 * N)})
+    errors = np.ones(2 * N)
+    people = Population(table, {"q": values}, {"q": errors})
     forest = people.plot("q").ax
     labels = [x.get_text() for x in forest.get_yticklabels()]
     assert labels.count("3") == 2
@@ -463,6 +533,7 @@ def test_figures_of_maps():
     ax = difference.plot().ax
     assert len(ax.collections) == 2, "the map and its outline"
     table = {"subject": np.arange(12)}
-    curves = PopulationMaps(table, y[:, 0], {"lag": AXES["lag"]})
+    lags = {"lag": AXES["lag"]}
+    curves = PopulationMaps(table, y[:, 0], lags)
     ax = curves.mean().plot().ax
     assert len(ax.get_lines()) == 12 + 3

@@ -38,14 +38,18 @@ def test_bad_recordings(time, signals, options, message):
 
 def test_trials_must_belong_together():
     one = hj.Recording(T, GOOD, units={"a": "N"}, name="one")
-    other = hj.Recording(T, {"b": T, "a": T}, units={"a": "N"}, name="two")
+    signals = {"b": T, "a": T}
+    other = hj.Recording(T, signals, units={"a": "N"}, name="two")
     both = hj.Recording.join([one, other])
-    np.testing.assert_array_equal(both.trials[1].values[:, both.column("b")], T)
+    column = both.column("b")
+    second = both.trials[1].values[:, column]
+    np.testing.assert_array_equal(second, T)
     assert "Recording(2 trials: a (N), b)" in repr(both)
     with pytest.raises(
         hj.errors.DefinitionError, match="'two' have different units of a: N and kN"
     ):
-        hj.Recording.join([one, hj.Recording(T, GOOD, units={"a": "kN"}, name="two")])
+        other_unit = hj.Recording(T, GOOD, units={"a": "kN"}, name="two")
+        hj.Recording.join([one, other_unit])
     with pytest.raises(
         hj.errors.DefinitionError, match="different signals: ..a', 'b'. and ..a"
     ):
@@ -56,9 +60,12 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("time (s);force [N];event strike\n0;1;0\n1;;1\n2;NA;0\n3;4;0\n")
     found = hj.read_recording(path)
-    assert found.signals == ("force",) and found.units == ("N",)
-    np.testing.assert_array_equal(found.trials[0].values[:, 0], [1, np.nan, np.nan, 4])
-    np.testing.assert_array_equal(found.trials[0].events["strike"], [1.0])
+    assert found.signals == ("force",)
+    assert found.units == ("N",)
+    first = found.trials[0].values[:, 0]
+    np.testing.assert_array_equal(first, [1, np.nan, np.nan, 4])
+    strikes = found.trials[0].events["strike"]
+    np.testing.assert_array_equal(strikes, [1.0])
     assert found.trials[0].name == "x"
     np.savez(
         tmp_path / "x.npz",
@@ -67,7 +74,8 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
         **{"event strike": [1.5]},
     )
     both = hj.read_recording([path, tmp_path / "x.npz"], units={"force": "kN"})
-    assert both.units == ("kN",) and both.trials[1].events["strike"] == [1.5]
+    assert both.units == ("kN",)
+    assert both.trials[1].events["strike"] == [1.5]
 
 
 @pytest.mark.parametrize(
@@ -96,9 +104,12 @@ def test_what_spreadsheets_write(tmp_path, text, encoding):
     found = hj.read_recording(
         tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time"
     )
-    assert found.signals == ("F",) and found.units == ("µN",)
-    np.testing.assert_allclose(found.trials[0].time, [0.5, 1.5], rtol=1e-15)
-    np.testing.assert_array_equal(found.trials[0].values[:, 0], [1.0, -0.25])
+    assert found.signals == ("F",)
+    assert found.units == ("µN",)
+    times = found.trials[0].time
+    np.testing.assert_allclose(times, [0.5, 1.5], rtol=1e-15)
+    first = found.trials[0].values[:, 0]
+    np.testing.assert_array_equal(first, [1.0, -0.25])
 
 
 OPENSIM = """Coordinates
@@ -139,7 +150,9 @@ def test_opensim(tmp_path, blanks):
     found = hj.read_recording(path)
     assert found.signals == ("pelvis_ty", "force_vx")
     assert [x.text for x in found.findings] == ["angles are in degrees."]
-    np.testing.assert_array_equal(found.trials[0].values, [[1, 2], [-0.25, 3]])
+    values = found.trials[0].values
+    expected = [[1, 2], [-0.25, 3]]
+    np.testing.assert_array_equal(values, expected)
     path.write_text(OPENSIM.replace("nRows=2", "nRows=3"))
     with pytest.raises(FileFormatError, match="2 rows, its header 3"):
         hj.read_recording(path)
@@ -153,11 +166,14 @@ def test_vicon(tmp_path, separator):
     found = hj.read_recording(path)
     plate = "Imported Plate - Force"
     toe = "TOE"
-    assert found.signals == (f"{plate}.Fx", f"{plate}.Fy", f"{toe}.X", f"{toe}.Y")
+    forces = (f"{plate}.Fx", f"{plate}.Fy", f"{toe}.X", f"{toe}.Y")
+    assert found.signals == forces
     assert found.units == ("N", "N", "mm", "mm")
-    np.testing.assert_allclose(found.trials[0].time, [0, 0.001, 0.002, 0.003])
+    times = found.trials[0].time
+    np.testing.assert_allclose(times, [0, 0.001, 0.002, 0.003])
     expected = [[1, 2, 3, 4], [10, np.nan, 11, np.nan]]
-    np.testing.assert_array_equal(found.trials[0].values[:, 1:3].T, expected)
+    values = found.trials[0].values[:, 1:3]
+    np.testing.assert_array_equal(values.T, expected)
     assert any("different rates" in x.text for x in found.findings)
     path.write_text(VICON.replace("500", "400"))
     with pytest.raises(FileFormatError, match="of different rates"):
@@ -199,21 +215,28 @@ def test_bad_csv(tmp_path, text, message):
 
 def test_the_unit_of_time(tmp_path):
     """Seconds, whatever the file says; assumed, and said, where it says nothing."""
-    np.savez(tmp_path / "x.npz", **{"time (ms)": T, "a": T, "event e": [1.5, 2.5]})
+    columns = {"time (ms)": T, "a": T, "event e": [1.5, 2.5]}
+    np.savez(tmp_path / "x.npz", **columns)
     found = hj.read_recording(tmp_path / "x.npz")
-    np.testing.assert_allclose(found.trials[0].time, T / 1000)
-    np.testing.assert_allclose(found.trials[0].events["e"], [1.5e-3, 2.5e-3])
-    frame = hj.Recording.from_frame({"time (ms)": T, "a (N)": T, "event e": T == 1})
-    np.testing.assert_allclose(frame.trials[0].time, T / 1000)
+    times = found.trials[0].time
+    np.testing.assert_allclose(times, T / 1000)
+    events = found.trials[0].events["e"]
+    np.testing.assert_allclose(events, [1.5e-3, 2.5e-3])
+    is_event = T == 1
+    frame = hj.Recording.from_frame({"time (ms)": T, "a (N)": T, "event e": is_event})
+    times_of_frame = frame.trials[0].time
+    np.testing.assert_allclose(times_of_frame, T / 1000)
     assert (frame.signals, frame.units, frame.trials[0].events["e"]) == (
         ("a",),
         ("N",),
         1e-3,
     )
     (tmp_path / "y.csv").write_text("frame,a\n0,1\n1,2\n2,4\n")
-    both = hj.Recording.join([hj.read_recording(tmp_path / "y.csv", time="frame")] * 2)
+    by_frame = hj.read_recording(tmp_path / "y.csv", time="frame")
+    both = hj.Recording.join([by_frame] * 2)
     assert "the times in 'frame' have no unit: taken as seconds" in repr(both)
-    assert "every 1 s (1 Hz)" in repr(both) and len(both.findings) == 1
+    assert "every 1 s (1 Hz)" in repr(both)
+    assert len(both.findings) == 1
     (tmp_path / "y.csv").write_text("time (samples),a\n0,1\n1,2\n2,4\n")
     with pytest.raises(
         hj.errors.DefinitionError, match="are in 'samples': convert them"
@@ -238,4 +261,5 @@ def test_a_recording_that_is_too_short_is_refused(rhythm, strides):
     inputs, *outputs = rhythm.signals
     names = dict(inputs=inputs, outputs=outputs, n_sections=8)
     with pytest.raises(hj.errors.DefinitionError, match="too few|reach beyond"):
-        hj.identify_recording(short, hj.Crossing(outputs[0], "rising"), **names)
+        crossing = hj.Crossing(outputs[0], "rising")
+        hj.identify_recording(short, crossing, **names)

@@ -19,7 +19,13 @@ from .conftest import MULTIPLIER
 from .mishaps import mishandle, misjudged
 
 
-CIRCLE = hj.KinematicPhase(8, position="x", velocity="v", center=(0, 0), scale=(1, 1))
+CIRCLE = hj.KinematicPhase(
+    8,
+    position="x",
+    velocity="v",
+    center=(0, 0),
+    scale=(1, 1),
+)
 
 
 def sample(recording, phase=CIRCLE, **options):
@@ -29,11 +35,14 @@ def sample(recording, phase=CIRCLE, **options):
 
 def test_a_circle(wave):
     data = sample(wave)
-    circle = np.cos(np.pi / 4 * np.arange(8))
-    np.testing.assert_allclose(data.cycle_outputs[:, 0], circle, atol=2e-3)
+    angles = np.pi / 4 * np.arange(8)
+    circle = np.cos(angles)
+    found = data.cycle_outputs[:, 0]
+    np.testing.assert_allclose(found, circle, atol=2e-3)
     (record,) = data.records
     (times,) = data.times
-    np.testing.assert_allclose(np.diff(times), 1 / 8, atol=1e-4)
+    steps_of_time = np.diff(times)
+    np.testing.assert_allclose(steps_of_time, 1 / 8, atol=1e-4)
     area = np.sin(3 * times)
     np.testing.assert_allclose(
         (
@@ -43,9 +52,11 @@ def test_a_circle(wave):
         np.diff(area) / 3 / np.diff(times),
         atol=2e-3,
     )
-    assert record.lead == 1 and sample(wave, bandwidth=np.inf).records[0].lead == 0
+    assert record.lead == 1
+    assert sample(wave, bandwidth=np.inf).records[0].lead == 0
     timed = sample(wave, timing="clock")
-    assert timed.outputs == ("x", "v", "time") and timed.rms()[1][2] < 1e-4
+    assert timed.outputs == ("x", "v", "time")
+    assert timed.rms()[1][2] < 1e-4
     with pytest.raises(
         hj.errors.DefinitionError, match="different n_sections: 16 and 8"
     ):
@@ -96,8 +107,10 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
             t[::step], dict(zip(names, trial.values[::step].T, strict=True))
         )
         data = sample(thin, inputs="force")
-        diagnosis = hj.recordings.diagnose(data, hj.fit_series(data, 1, check=False))
-        assert any(w.cause == "sampling" for w in diagnosis.findings) == few
+        fit = hj.fit_series(data, 1, check=False)
+        diagnosis = hj.recordings.diagnose(data, fit)
+        named = any(w.cause == "sampling" for w in diagnosis.findings)
+        assert named == few
 
 
 def test_gaps_are_masked_and_cut(wave):
@@ -107,16 +120,20 @@ def test_gaps_are_masked_and_cut(wave):
         np.nan
     )  # of an output, too short to lose the count
     values[(t > 9.1) & (t < 9.3), 0] = np.nan  # of the input, longer than a section
-    values[(t > 14) & (t < 16), 1:] = np.nan
+    hidden = (t > 14) & (t < 16)
+    values[hidden, 1:] = np.nan
     data = sample(
         hj.Recording(t, dict(zip("fxv", values.T, strict=True))), timing="duration"
     )
     assert len(data.records) == 2
     for record, times in zip(data.records, data.times, strict=True):
-        lost, x = np.isnan(record.y[:, [0, 2]]).T
-        np.testing.assert_array_equal(x, lost | np.append(True, lost[:-1]))
+        y = record.y[:, [0, 2]]
+        lost, x = np.isnan(y).T
+        lost_before = np.append(True, lost[:-1])
+        np.testing.assert_array_equal(x, lost | lost_before)
         np.testing.assert_array_equal(lost & (times > 4.29) & (times < 4.51), lost)
-        end = np.append(times[1:], times[-1] + 0.125)
+        last = times[-1] + 0.125
+        end = np.append(times[1:], last)
         np.testing.assert_array_equal(
             np.isnan(record.u[:, 0]), (end > 9.11) & (times < 9.29)
         )
@@ -141,12 +158,14 @@ def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     names = {"inputs": "force", "outputs": ("x", "v"), "n_sections": 8}
     found = hj.identify_recording(paused, hj.AtEvent("top"), order=1, **names)
     assert found.fit.contains([MULTIPLIER], 0.999).all()
-    assert found.phase.dropped == 10 and len(found.phase.stretches[0]) == 12
+    assert found.phase.dropped == 10
+    assert len(found.phase.stretches[0]) == 12
     assert found.phase.cycles + found.phase.missed == 199
     held = found.held_out.validation
     assert f"compare, left out: {held.left_out}" in repr(found)
     assert max(map(len, repr(found.held_out).splitlines())) <= 100
-    assert held.independent and held.fit.min() > 50
+    assert held.independent
+    assert held.fit.min() > 50
 
 
 def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
@@ -159,18 +178,19 @@ def test_gaps_over_crossings_leave_no_wrong_section(rhythm):
     hidden = values.copy()
     for at in rng.choice(np.arange(10, 190), 5, replace=False):
         start = at + 0.5 - rng.uniform(0.02, 0.18)
-        hidden[(t > start) & (t < start + 0.2), 1:] = np.nan
+        is_hidden = (t > start) & (t < start + 0.2)
+        hidden[is_hidden, 1:] = np.nan
     options = {"inputs": "force", "n_sections": 16, "bandwidth": 8.0}
     both = [
         hj.Recording(t, dict(zip(names, x.T, strict=True))) for x in (values, hidden)
     ]
     clean, dirty = (sample(x, top, **options) for x in both)
-    assert len(dirty.records) == 6 and dirty.cycles == pytest.approx(
-        clean.cycles - 10, abs=0.1
-    )
+    assert len(dirty.records) == 6
+    assert dirty.cycles == pytest.approx(clean.cycles - 10, abs=0.1)
     (before,) = clean.times
     for record, times in zip(dirty.records, dirty.times, strict=True):
-        first = int(np.argmin(np.abs(before - times[0])))
+        distance = np.abs(before - times[0])
+        first = int(np.argmin(distance))
         true = slice(first, first + len(times))
         np.testing.assert_allclose(times, before[true], atol=2e-3)
         assert (
@@ -225,11 +245,16 @@ def test_designs_as_tables(tmp_path, wave):
     with pytest.raises(hj.errors.FileFormatError, match="must be a table by phase"):
         hj.recordings.attach_design(wave, phase, tmp_path / "time.csv")
     lines = (tmp_path / "phase.csv").read_text().splitlines()
-    (tmp_path / "one.csv").write_text("\n".join(lines[: 1 + 19 * 8]))
+    head = lines[: 1 + 19 * 8]
+    (tmp_path / "one.csv").write_text("\n".join(head))
     told = hj.recordings.attach_design(wave, phase, tmp_path / "one.csv")
     data = sample(told, phase, inputs="u", sampled="middle")
-    section = (data.records[0].first_section + np.arange(len(data.records[0].u))) % 8
-    u = data.records[0].u[:, 0] + data.cycle_inputs[section, 0]
+    record = data.records[0]
+    samples = np.arange(len(record.u))
+    section = (record.first_section + samples) % 8
+    of_cycle = data.cycle_inputs[section, 0]
+    deviation = data.records[0].u[:, 0]
+    u = deviation + of_cycle
     first = -data.records[0].first_section % 8
     np.testing.assert_allclose(
         u[first : first + 150], design.signals(19)[0, :150, 0], atol=1e-9
@@ -239,7 +264,8 @@ def test_designs_as_tables(tmp_path, wave):
     ):
         hj.recordings.attach_design(wave, phase, tmp_path / "phase.csv")
     experiments = data.experiments(periods=16)
-    assert experiments.u.shape[1] % 8 == 0 and experiments.n_sections == 8
+    assert experiments.u.shape[1] % 8 == 0
+    assert experiments.n_sections == 8
 
 
 @pytest.fixture(scope="module")
@@ -272,7 +298,8 @@ def identify(files, out, *more):
         "--sections",
         "16",
     ]
-    return main(["identify", *trials, *options, "--out", str(out), *more])
+    arguments = ["identify", *trials, *options, "--out", str(out), *more]
+    return main(arguments)
 
 
 @pytest.fixture(scope="module")
@@ -294,11 +321,13 @@ def summary(out):
 
 @pytest.mark.slow
 def test_the_summary_of_the_command(summary):
-    (found,) = np.array(summary["multipliers"]) @ [1, 1j]
+    pairs = np.array(summary["multipliers"])
+    (found,) = pairs @ [1, 1j]
     assert abs(found - MULTIPLIER) < 2e-2
     assert summary["held_out_fit_percent"][0] > 80
     assert summary["sampling_rates"] == pytest.approx([64, 64])
-    assert summary["units"] == {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+    units = {"time": "s", "force": "N", "x": "m", "v": "m/s"}
+    assert summary["units"] == units
 
 
 @pytest.mark.slow
@@ -309,7 +338,8 @@ def test_the_page_of_the_command(out, summary):
     assert "p &lt; 0.001" in page or "p = " in page
 
     above_figures = page[: page.index("<img")]
-    (found,) = np.array(summary["multipliers"]) @ [1, 1j]
+    pairs_of_new = np.array(summary["multipliers"])
+    (found,) = pairs_of_new @ [1, 1j]
     assert "± standard error" in above_figures
     assert f"<td>{found.real:.3f}" in above_figures
     assert "from force (N) to x (m), v (m/s)" in above_figures
@@ -324,12 +354,14 @@ def test_the_page_of_the_command(out, summary):
 
 @pytest.mark.slow
 def test_the_files_of_the_command(out):
-    assert hj.load(out / "fit.npz").contains([MULTIPLIER], 0.999).all()
+    fit = hj.load(out / "fit.npz")
+    assert fit.contains([MULTIPLIER], 0.999).all()
     assert hj.load(out / "htf.npz").variance is not None
     rows = (out / "sections.csv").read_text().splitlines()
     assert rows[0] == "trial,record,cycle,section,time (s),force (N),x (m),v (m/s)"
     assert len(rows) > 16 * 190
-    assert {p.suffix for p in (out / "figures").iterdir()} == {".png"}
+    formats = {p.suffix for p in (out / "figures").iterdir()}
+    assert formats == {".png"}
     assert (out / "notes.txt").read_text() == "mine"
 
 
@@ -352,7 +384,8 @@ def test_the_command_computes_nothing_where_a_file_is_in_the_way(
     with pytest.raises(SystemExit, match=f"{name}' is in the way"):
         identify(files, tmp_path)
     assert not capsys.readouterr().out
-    assert [p.read_text() for p in tmp_path.rglob("*") if p.is_file()] == ["mine"]
+    written = [p.read_text() for p in tmp_path.rglob("*") if p.is_file()]
+    assert written == ["mine"]
 
 
 def test_signals_with_clocks_of_their_own(rhythm):
@@ -387,30 +420,37 @@ def test_responses_of_a_model_are_by_the_section_of_the_push():
     b = np.array([1.0, 2.0, 3.0, 4.0])
     c = np.array([5.0, 7.0, 11.0, 13.0])
     columns = (x[:, None, None] for x in (b, c))
-    model = hj.linear.LDTP(np.full((N, 1, 1), a), *columns, inputs="f", outputs="x")
+    A = np.full((N, 1, 1), a)
+    model = hj.linear.LDTP(A, *columns, inputs="f", outputs="x")
     zero = np.zeros((N, 7, 1, 1))
-    grid = (np.arange(N) / N, np.arange(7) / N)
+    phases = np.arange(N) / N
+    grid = (phases, np.arange(7) / N)
     steps = np.array([0.2, 0.4, 0.6, 0.8])
-    times = np.cumsum(np.tile(np.roll(steps, 1), 60))
+    rotated = np.roll(steps, 1)
+    times = np.cumsum(np.tile(rotated, 60))
     found = ImpulseResponses(zero, zero, *grid, 0.0, steps, ("f",), ("x",))
     m = np.arange(N)[:, None]
     r = np.arange(1, 7)
-    expected = b[m] * a ** (r - 1) * c[(m + r) % N] / steps[m]
-    np.testing.assert_allclose(found.of_model(model)[:, 1:, 0, 0], expected, rtol=1e-13)
+    answer = b[m] * a ** (r - 1) * c[(m + r) % N]
+    expected = answer / steps[m]
+    found_responses = found.of_model(model)[:, 1:, 0, 0]
+    np.testing.assert_allclose(found_responses, expected, rtol=1e-13)
     # Their standard errors are the scatter of fits.
     apart = []
     rng = np.random.default_rng(0)
     about = dict(inputs=("f",), outputs=("x",))
     for _ in range(60):
         u = rng.normal(size=(240, 1))
-        y = np.asarray(model.simulate(u)) + 20 * rng.normal(size=(240, 1))
+        response = np.asarray(model.simulate(u))
+        y = response + 20 * rng.normal(size=(240, 1))
         record = hj.experiments.SectionSeries(u, y, n_sections=N, **about)
         cycle = np.zeros((N, 1))
         data = SectionData((record,), (times,), (0,), cycle, cycle, 2.0, 2.0, (0, 0))
         found = impulse_responses(
             hj.fit_series(record, 1, check=False), data, 4, width=0.0
         )
-        apart.append((found.values - found.of_model(model)) / found.errors)
+        difference = found.values - found.of_model(model)
+        apart.append(difference / found.errors)
     np.testing.assert_allclose(found.durations, steps)
     size = np.sqrt(
         np.mean(np.array(apart)[:, :, [[1, 2, 3, 4], [13, 14, 15, 16]]] ** 2, (0, 1, 3))

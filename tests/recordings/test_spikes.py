@@ -13,7 +13,8 @@ WAVE = np.sin(2 * np.pi * T)
 
 
 def noisy(x, noise=1e-3, seed=0):
-    return x + noise * np.random.default_rng(seed).normal(size=len(x))
+    rng = np.random.default_rng(seed)
+    return x + noise * rng.normal(size=len(x))
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-1])
@@ -23,14 +24,17 @@ def test_all_spikes_are_found_and_little_else(noise):
     clean = noisy(WAVE, noise)
     struck = rng.random(len(T)) < 0.02
     struck &= np.convolve(struck, [1, 1, 1, 1], "same") < 4  # three in a row at most
-    x = clean + struck * rng.choice([-15, 15], len(T))
+    spikes = rng.choice([-15, 15], len(T))
+    x = clean + struck * spikes
     found = spike_heights(x)
     assert (found != 0)[struck].mean() > 0.999
     assert (found != 0)[~struck].mean() < 1e-3
-    assert_allclose(np.abs(found[struck & (found != 0)]), 15, atol=1)
+    seen = struck & (found != 0)
+    assert_allclose(np.abs(found[seen]), 15, atol=1)
     kept = without_spikes(x)
     assert_array_equal(np.isnan(kept), found != 0)
-    assert_array_equal(kept[found == 0], x[found == 0])
+    is_clean = found == 0
+    assert_array_equal(kept[is_clean], x[is_clean])
 
 
 def pulse(width):
@@ -42,7 +46,9 @@ def pulse(width):
     return x
 
 
-RINGING = np.exp(-40 * (T % 1)) * np.where(np.arange(len(T)) % 2, 1, -1)
+SIGNS = np.where(np.arange(len(T)) % 2, 1, -1)
+decay = np.exp(-40 * (T % 1))
+RINGING = decay * SIGNS
 
 
 @pytest.mark.parametrize(
@@ -63,20 +69,27 @@ RINGING = np.exp(-40 * (T % 1)) * np.where(np.arange(len(T)) % 2, 1, -1)
     ],
 )
 def test_what_is_no_spike(x):
-    for values in (x, x + 1e-5 * np.random.default_rng(3).normal(size=len(x))):
+    draws = np.random.default_rng(3).normal(size=len(x))
+    noise = 1e-5 * draws
+    for values in (x, x + noise):
         assert not spike_heights(values).any()
 
 
 def test_pulses_are_the_input_and_spikes_are_not():
     """Single samples stand out of a smooth force only as errors."""
     single = np.zeros(len(T))
-    single[np.random.default_rng(2).integers(0, len(T), 100)] = 10.0
-    assert (input_spikes(noisy(WAVE) + single) != 0)[single > 0].all()
+    places = np.random.default_rng(2).integers(0, len(T), 100)
+    single[places] = 10.0
+    found = input_spikes(noisy(WAVE) + single) != 0
+    assert found[single > 0].all()
     assert not input_spikes(single).any()
     assert not input_spikes(noisy(single, 0.1)).any()
-    assert not input_spikes(hj.experiments.random_input(40, 500, 8)[:, 0]).any()
+    inputs = hj.experiments.random_input(40, 500, 8)
+    force = inputs[:, 0]
+    assert not input_spikes(force).any()
     rng = np.random.default_rng(0)
-    assert not input_spikes(np.repeat(rng.normal(size=5000), 4)).any()
+    held = np.repeat(rng.normal(size=5000), 4)
+    assert not input_spikes(held).any()
 
 
 def test_impacts_are_part_of_the_motion(wave):
@@ -91,7 +104,8 @@ def test_impacts_are_part_of_the_motion(wave):
     phase = hj.KinematicPhase(8, position="x", velocity="v")
 
     def sampled(more):
-        recording = hj.Recording(t, {"f": f, "x": x + more, "v": v})
+        signals = {"f": f, "x": x + more, "v": v}
+        recording = hj.Recording(t, signals)
         return hj.recordings.sample_sections(recording, phase, **options)
 
     assert sampled(impact).spikes == (0, 0, 0)
@@ -99,4 +113,6 @@ def test_impacts_are_part_of_the_motion(wave):
     assert both.spikes == (0, 3, 0)
     assert "spikes left out: x 3)" in repr(both)
     assert_allclose(both.cycle_outputs, sampled(impact).cycle_outputs, atol=5e-3)
-    assert np.ptp(both.cycle_outputs[:, 0] - sampled(0 * t).cycle_outputs[:, 0]) > 0.05
+    without = sampled(0 * t)
+    change = both.cycle_outputs[:, 0] - without.cycle_outputs[:, 0]
+    assert np.ptp(change) > 0.05

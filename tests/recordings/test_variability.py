@@ -31,15 +31,20 @@ def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
         x = 0.0
         y = []
         for n in range(count * N):
-            y.append(gains[n % N] * np.real(x))
-            x = multiplier ** (1 / N) * x + rng.normal()
+            value = gains[n % N] * np.real(x)
+            y.append(value)
+            decayed = multiplier ** (1 / N) * x
+            x = decayed + rng.normal()
         y = np.array(y)
-        slow = drift * np.sin(np.arange(len(y))[:, None] / 800)
-        y += y.std(axis=0) * (noise * rng.normal(size=y.shape) + slow)
+        places = np.arange(len(y))[:, None]
+        slow = drift * np.sin(places / 800)
+        errors = noise * rng.normal(size=y.shape)
+        y += y.std(axis=0) * (errors + slow)
         signals = {f"y{i}": column for i, column in enumerate(y.T)}
         t = np.arange(len(y)) / N
         events = {"e": np.arange(count)}
-        trials.append(hj.Recording(t, signals, events=events, name=f"{len(trials)}"))
+        name = f"{len(trials)}"
+        trials.append(hj.Recording(t, signals, events=events, name=name))
     return hj.Recording.join(trials)
 
 
@@ -56,7 +61,8 @@ def test_a_recording_without_inputs_is_identified_by_its_variability(tmp_path):
     fit = hj.load(tmp_path / "report" / "fit.npz")
     population = hj.recordings.Population.from_fits([fit], {"subject": ["S1"]})
     modulus = result.fit.modulus[0]
-    half_life = np.log(2) / population.values["decay"][0]
+    decay = population.values["decay"][0]
+    half_life = np.log(2) / decay
     assert modulus**half_life == pytest.approx(0.5)
     with pytest.raises(hj.errors.DefinitionError, match="name `inputs`, too"):
         hj.identify_recording(recording, hj.AtEvent("e"), references="y0", **options)
@@ -68,7 +74,8 @@ def test_a_pair_has_one_interval_that_contains_the_estimate():
     rng = np.random.default_rng(0)
     angle = rng.uniform(0.2, 0.6, 500)
     ratio = rng.uniform(1.1, 1.8, 500)
-    pairs = 0.5 * np.exp(1j * np.stack([angle, -angle], axis=1))
+    angles = np.stack([angle, -angle], axis=1)
+    pairs = 0.5 * np.exp(1j * angles)
     both_real = 0.5 * np.stack([1 / ratio, ratio], axis=1)
     draws = np.concatenate([pairs, both_real])
     noise = 1 + 0.1 * rng.normal(size=(1000, 1))
@@ -105,7 +112,8 @@ def test_too_few_multipliers_are_a_finding():
     assert "Order: 2 multipliers give 0.5" in repr(single)
     require_no_finding("order", hj.recordings.natural_multipliers(pair, 2))
     # (One of two intervals is enough.)
-    half = hj.recordings.natural_multipliers(variable(0.1, (60, 60), 0.3 + 0.5j, 2))
+    recording = variable(0.1, (60, 60), 0.3 + 0.5j, 2)
+    half = hj.recordings.natural_multipliers(recording)
     require_no_finding("order", half)
 
 
@@ -122,21 +130,25 @@ def require_no_finding(cause, fit):
 
 def test_short_records_are_drawn_whole():
     """No interval is narrow because a record holds only one block."""
-    found = hj.recordings.natural_multipliers(variable(0.1, strides=(5,) * 12))
+    short = variable(0.1, strides=(5,) * 12)
+    found = hj.recordings.natural_multipliers(short)
     assert np.ptp(found.interval()) > 0.2
     assert any(text.cause == "few cycles" for text in found.findings)
     assert found.block * found.records == found.cycles
     assert (
         np.ptp(hj.recordings.natural_multipliers(variable(0.1, (11,))).interval()) > 0.2
     )
-    many = hj.recordings.natural_multipliers(variable(0.1, (20,) * 60))
+    longer = variable(0.1, (20,) * 60)
+    many = hj.recordings.natural_multipliers(longer)
     assert abs(many.multipliers[0] - 0.6) < 0.06  # (0.13 without the correction)
 
 
 def test_intervals_of_few_blocks_are_wider_than_percentiles():
     found = hj.recordings.natural_multipliers(variable(0.3, strides=(39, 40)))
-    plain = np.ptp(np.quantile(np.abs(found.draws[:, 0]), [0.025, 0.975]))
-    assert 1.1 < np.ptp(found.interval()[0]) / plain < 1.4
+    moduli = np.abs(found.draws[:, 0])
+    plain = np.ptp(np.quantile(moduli, [0.025, 0.975]))
+    length = np.ptp(found.interval()[0])
+    assert 1.1 < length / plain < 1.4
 
 
 def turning(modulus, angle, cycles, seed):
@@ -145,7 +157,9 @@ def turning(modulus, angle, cycles, seed):
     z = np.zeros(cycles * N, complex)
     for k in range(1, len(z)):
         noise = rng.normal() + 1j * rng.normal()
-        z[k] = modulus ** (1 / N) * np.exp(1j * angle / N) * z[k - 1] + noise
+        turn = modulus ** (1 / N) * np.exp(1j * angle / N)
+        turned = turn * z[k - 1]
+        z[k] = turned + noise
     signals = {"a": z.real, "b": z.imag}
     recording = hj.Recording(
         np.arange(len(z)) / N, signals, events={"e": np.arange(cycles)}
@@ -174,4 +188,5 @@ def test_an_input_that_repeats_with_the_rhythm_is_named(rhythm):
     assert list(feedback(given)) == []
     loop = hj.recordings.sample_sections(marked, inputs="x", outputs="v", **sections)
     (finding,) = feedback(loop)
-    assert finding.cause == "feedback" and "repeats with the cycle" in finding.text
+    assert finding.cause == "feedback"
+    assert "repeats with the cycle" in finding.text

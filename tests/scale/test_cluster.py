@@ -27,7 +27,9 @@ class Plane(hj.Chart):
     states = ("x", "v")
 
     def field(self, t, q, u):
-        return q[1], u[0] + jnp.cos(2 * jnp.pi * t) - 20.0 * q[0] - 1.0 * q[1]
+        push = u[0] + jnp.cos(2 * jnp.pi * t)
+        spring = 20.0 * q[0]
+        return q[1], push - spring - 1.0 * q[1]
 
 
 class Driven(hj.HybridSystem):
@@ -44,7 +46,8 @@ def walk(rng):
     """A random computation that takes a while."""
     time.sleep(0.02)
     steps = rng.normal(size=(STEPS, 2)).cumsum(axis=0)
-    return {"end": steps[-1], "far": np.abs(steps).max()}
+    farthest = np.abs(steps).max()
+    return {"end": steps[-1], "far": farthest}
 
 
 def fails(rng):
@@ -75,7 +78,8 @@ def test_draws_have_streams_of_their_own(whole):
         expected = walk(np.random.default_rng(stream))
         assert_array_equal(whole.end[i], expected["end"])
         assert whole.far[i] == expected["far"]
-    assert_array_equal(hj.scale.monte_carlo(walk, 3, seed=7).end, whole.end[:3])
+    fewer = hj.scale.monte_carlo(walk, 3, seed=7)
+    assert_array_equal(fewer.end, whole.end[:3])
 
 
 def test_draws_that_fail_are_named():
@@ -145,7 +149,8 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
         (values / "c").symlink_to(victim)
     elif harm == "shape":
         about = (values / "zarr.json").read_text()
-        (values / "zarr.json").write_text(re.sub(r"\b4\b", f"{10**12}", about, count=1))
+        larger = re.sub(r"\b4\b", f"{10**12}", about, count=1)
+        (values / "zarr.json").write_text(larger)
     elif harm == "absent":
         shutil.rmtree(values)
     elif harm == "start":
@@ -225,9 +230,11 @@ def test_workers_with_other_code_are_refused(client, monkeypatch):
 @pytest.fixture(scope="module")
 def experiments():
     """A stable linear oscillator with a clock: compiled in a moment."""
-    cycle = hj.find_limit_cycle(Driven(), hj.Guess("all", (0.0, 0.0)))
+    guess = hj.Guess("all", (0.0, 0.0))
+    cycle = hj.find_limit_cycle(Driven(), guess)
     rng = np.random.default_rng(0)
-    u = 0.1 * rng.normal(size=(6, 4 * 14, 1))
+    draws = rng.normal(size=(6, 4 * 14, 1))
+    u = 0.1 * draws
     return cycle, hj.ClockPhase(4), u, "x"
 
 
@@ -247,4 +254,6 @@ def test_workers_run_experiments_into_a_store(client, experiments, tmp_path):
     whole = hj.fit_series(data, 2, check=False)
     assert_allclose(parts.coefficients, whole.coefficients, rtol=0, atol=1e-12)
     assert_allclose(parts.covariance, whole.covariance, rtol=1e-12)
-    assert repr(hj.validate(whole, stored)) == repr(hj.validate(whole, data))
+    of_store = repr(hj.validate(whole, stored))
+    of_data = repr(hj.validate(whole, data))
+    assert of_store == of_data

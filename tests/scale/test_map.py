@@ -43,7 +43,9 @@ def whole(wheel, options):
 
 def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     """That of the rimless wheel is cos^2 of the angle between spokes (McGeer 1990)."""
-    expected = np.broadcast_to(np.cos(2 * np.pi / OVER["spokes"]) ** 2, (3, 3))
+    angle = 2 * np.pi / OVER["spokes"]
+    multiplier = np.cos(angle) ** 2
+    expected = np.broadcast_to(multiplier, (3, 3))
     assert_allclose(whole.spectral_radius, expected, rtol=1e-7)
     assert whole.spectral_radius.dims == ("slope", "spokes")
     assert (whole.result == 0).all()
@@ -67,7 +69,9 @@ def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     found = hj.sweep(hj.models.RimlessWheel(), points, **options)
     assert np.flatnonzero(found.result).tolist() == [2]
     assert np.isnan(found.period[2])
-    expected = np.delete(np.cos(2 * np.pi / found.spokes.values) ** 2, 2)
+    angle = 2 * np.pi / found.spokes.values
+    multiplier = np.cos(angle) ** 2
+    expected = np.delete(multiplier, 2)
     assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
 
 
@@ -98,7 +102,8 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
     with pytest.raises(
         hj.errors.DefinitionError, match=r"`values.slope` is not the same"
     ):
-        run(over=small | {"slope": np.array([0.071, 0.08])})
+        other = small | {"slope": np.array([0.071, 0.08])}
+        run(over=other)
     with pytest.raises(
         hj.errors.DefinitionError, match=r"`model.numbers.rate` is 1.0, not 1.1"
     ):
@@ -126,14 +131,17 @@ def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     def twice(cycle):
         if float(cycle.system.slope) > 0.08:
             raise hj.errors.ComputationError("too steep")
-        return jnp.stack([cycle.period, cycle.trajectory(2.0).t[-1]])
+        two_periods = cycle.trajectory(2.0)
+        return jnp.stack([cycle.period, two_periods.t[-1]])
 
     found = hj.sweep(model, points, ("period", twice), guess=wheel, chunk=4)
     assert found.period.dims == ("point",)
     assert set(found.coords) == {"slope", "spokes"}
-    expected = whole.period.values[::2, ::2].T.ravel()
+    part = whole.period.values[::2, ::2]
+    expected = part.T.ravel()
     assert_allclose(found.period, expected, rtol=1e-9)
-    expected = float(found.period[0]) * np.array([1, 2])
+    period = float(found.period[0])
+    expected = period * np.array([1, 2])
     assert_allclose(found.twice[0], expected)
     assert np.isnan(found.twice[1]).all()
     for wrong, message in (
@@ -154,7 +162,8 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert values.max() <= high
         measured = np.histogram(values, 4, (low, high))[0].tolist()
         assert measured == (pytest.approx([12] * 4, abs=2))
-        assert_array_equal(values, SweepPoints.sobol(ranges, 48, seed=3).values[name])
+        expected = SweepPoints.sobol(ranges, 48, seed=3).values[name]
+        assert_array_equal(values, expected)
 
 
 def test_sweep_draws_a_map(tmp_path, capsys):
@@ -197,11 +206,14 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
         alone = hj.find_limit_cycle(cycle.system, cycle)
         assert cycle.event_sequence == alone.event_sequence
         assert_allclose(cycle.anchor.q, alone.anchor.q, atol=1e-9)
-        assert_allclose(found.multipliers[i, :2], alone.multipliers, atol=1e-8)
+        leading = found.multipliers[i, :2]
+        assert_allclose(leading, alone.multipliers, atol=1e-8)
         assert_allclose(cycle.multipliers, alone.multipliers, atol=1e-8)
     assert np.all(found.residual[:4] <= 1e-10)
-    assert len(np.unique(found.anchor.chart[:4])) == 2  # also in other charts
-    assert_allclose(found.multipliers[:4, 2:], 0.0, atol=1e-9)
+    charts = np.unique(found.anchor.chart[:4])
+    assert len(charts) == 2  # also in other charts
+    others = found.multipliers[:4, 2:]
+    assert_allclose(others, 0.0, atol=1e-9)
 
 
 def test_without_a_clock_and_in_waves(wheel):
@@ -214,7 +226,8 @@ def test_without_a_clock_and_in_waves(wheel):
     assert np.all(np.diff(found.period) < 0)
     assert found.period[-1] < 0.7 * wheel.period
     assert_allclose(found.multipliers[:, 0], 0.5, atol=1e-7)
-    assert {found[i].event_sequence for i in range(11)} == {(0,)}
+    sequences = {found[i].event_sequence for i in range(11)}
+    assert sequences == {(0,)}
 
 
 def test_systems_that_are_alike_or_undefined(wheel):
@@ -225,7 +238,8 @@ def test_systems_that_are_alike_or_undefined(wheel):
     assert_array_equal(found.failed, [9])
     assert np.isnan(found.multipliers[9]).all()
     assert np.isfinite(found.multipliers[:9]).all()
-    assert found.summary().split()[:3] == ["10/11", "found;", "#9:"]
+    words = found.summary().split()
+    assert words[:3] == ["10/11", "found;", "#9:"]
     assert hj.orbits.find_limit_cycles(
         [found[0].system] * 6, wheel, execution=FOUR
     ).ok.all()

@@ -35,7 +35,8 @@ class Chosen(hj.sections.AbstractSections):
         return hj.sections.BoundSections.at_times(self.values * orbit.period)
 
     def describe(self, i):
-        return f"section {i} (at {float(self.values[i]):.3g})"
+        value = float(self.values[i])
+        return f"section {i} (at {value:.3g})"
 
 
 class Levels(hj.sections.AbstractLevels):
@@ -56,8 +57,10 @@ class FallingPast(Chosen):
 
 
 def test_a_family_of_clock_phases(hopper_cycle):
-    placed = hj.sections.place_sections(hopper_cycle, Chosen([0.1, 0.25, 0.8]))
-    assert_allclose(placed.lanes.t % 1, [0.1, 0.25, 0.8], atol=1e-12)
+    family = Chosen([0.1, 0.25, 0.8])
+    placed = hj.sections.place_sections(hopper_cycle, family)
+    phases = placed.lanes.t % 1
+    assert_allclose(phases, [0.1, 0.25, 0.8], atol=1e-12)
     ldtp = hj.linearize(hopper_cycle, placed, "yM")
     assert_allclose(ldtp.multipliers, hopper_cycle.multipliers, atol=1e-9)
 
@@ -69,7 +72,8 @@ def test_a_family_of_levels(vanderpol_cycle):
     own = hj.sections.place_sections(vanderpol_cycle, family)
     listed = hj.sections.place_sections(vanderpol_cycle, one_by_one)
     assert_allclose(own.lanes.q, listed.lanes.q, atol=1e-12)
-    assert_allclose(own.observe("x")[:, 0], family.values, atol=1e-12)
+    observed = own.observe("x")[:, 0]
+    assert_allclose(observed, family.values, atol=1e-12)
     a = hj.linearize(vanderpol_cycle, own, "v")
     b = hj.linearize(vanderpol_cycle, listed, "v")
     assert_allclose(a.A, b.A, atol=1e-12)
@@ -81,8 +85,10 @@ def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
     family = hj.sections.ArcLength(8, OUTPUTS, APEX, scale=scale)
     placed = hj.sections.place_sections(hopper_cycle, family)
     t, *signals = hopper_cycle.trajectory(3.0)(*OUTPUTS, per_step=200)
-    steps = np.diff(np.stack(signals) / scale[:, None], axis=1)
-    length = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=0)))
+    scaled = np.stack(signals) / scale[:, None]
+    steps = np.diff(scaled, axis=1)
+    lengths = np.linalg.norm(steps, axis=0)
+    length = np.append(0.0, np.cumsum(lengths))
     at = np.append(placed.lanes.t, placed.lanes.t[0] + 1.0) + np.ceil(
         t[0] - placed.lanes.t[0]
     )

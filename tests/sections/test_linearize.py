@@ -30,7 +30,8 @@ def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochro
     assert_allclose(placed_isochrons.lanes.q.T, padded(data["q"]), atol=1e-10)
     assert_array_equal(isochron_ldtp.dims, data["dim"])
     assert_allclose(isochron_ldtp.A, padded(data["A"]), atol=1e-8)
-    assert_allclose(isochron_ldtp.B[..., 0], padded(data["B"]), atol=1e-8)
+    expected = padded(data["B"])
+    assert_allclose(isochron_ldtp.B[..., 0], expected, atol=1e-8)
     assert_allclose(isochron_ldtp.C, padded(data["C"]), atol=1e-12)
     assert_array_equal(isochron_ldtp.D, np.zeros((32, 2, 1)))
     markov = isochron_ldtp.impulse_response(97)[..., 0]
@@ -39,9 +40,14 @@ def test_isochrons_agree_with_the_reference(reference, placed_isochrons, isochro
 
 def test_all_lines_of_the_transfer_function(reference, isochron_ldtp):
     data = reference("htf_exact_isochron")
-    H = np.asarray(isochron_ldtp.htf(data["f"]).H)[..., 0].transpose(1, 0, 2)
-    largest = np.abs(data["H"][:, 16]).max(axis=0)
-    assert np.all(np.abs(H - data["H"]).max(axis=(0, 1)) <= 1e-8 * largest)
+    response = isochron_ldtp.htf(data["f"])
+    values = np.asarray(response.H)[..., 0]
+    H = values.transpose(1, 0, 2)
+    modulus = np.abs(data["H"][:, 16])
+    largest = modulus.max(axis=0)
+    apart = np.abs(H - data["H"])
+    error = apart.max(axis=(0, 1))
+    assert np.all(error <= 1e-8 * largest)
 
 
 @pytest.mark.parametrize("family", ["isochron_ldtp", "kinematic_ldtp"])
@@ -51,7 +57,8 @@ def test_multipliers_are_the_same_from_every_section(family, hopper_cycle, reque
     assert_allclose(hopper_cycle.multipliers, truth, atol=1e-9)
     assert_allclose(ldtp.multipliers, truth, atol=1e-9)
     for i in range(32):
-        found = sorted(np.linalg.eigvals(np.asarray(ldtp.monodromy(i))), key=abs)
+        monodromy = np.asarray(ldtp.monodromy(i))
+        found = sorted(np.linalg.eigvals(monodromy), key=abs)
         measured = sorted(found[-2:], key=np.imag)
         assert_allclose(measured, truth[::-1], atol=1e-9)
         assert ldtp.rank(i) == 2
@@ -101,8 +108,10 @@ def check_against_differences(ldtp, sections, points, retention, subset):
         J = hopper_scipy.jacobian(points[i], here, there, before, after, retention)
         A = np.asarray(ldtp.A)[i, : len(after), : len(before)]
         B = np.asarray(ldtp.B)[i, : len(after), 0]
-        assert_allclose(A, J[:, :-1], rtol=0, atol=tolerance_A, err_msg=f"A[{i}]")
-        assert_allclose(B, J[:, -1], rtol=0, atol=tolerance_B, err_msg=f"B[{i}]")
+        by_state = J[:, :-1]
+        assert_allclose(A, by_state, rtol=0, atol=tolerance_A, err_msg=f"A[{i}]")
+        by_input = J[:, -1]
+        assert_allclose(B, by_input, rtol=0, atol=tolerance_B, err_msg=f"B[{i}]")
 
 
 def test_kinematic_sections_agree_with_scipy(
@@ -115,7 +124,8 @@ def test_kinematic_sections_agree_with_scipy(
     states = np.asarray(placed_kinematic.lanes.q)
     for i, (time, *state) in enumerate(points):
         assert_allclose(times[i], time, rtol=0, atol=1e-10)
-        assert_allclose(states[: len(state), i], state, rtol=0, atol=1e-10)
+        reached = states[: len(state), i]
+        assert_allclose(reached, state, rtol=0, atol=1e-10)
     check_against_differences(kinematic_ldtp, sections, points, 1.0, range(32))
 
 
@@ -159,7 +169,8 @@ def test_a_cycle_that_is_rest():
     """Where the state stands still, only its derivatives say how short steps must be."""
     cycle = hj.find_limit_cycle(hj.models.Mathieu(delta=1.0, epsilon=0.4))
     found = hj.linearize(cycle, hj.ClockPhase(4)).multipliers
-    assert_allclose(np.sort(found), np.sort(cycle.multipliers), rtol=1e-10)
+    expected = np.sort(cycle.multipliers)
+    assert_allclose(np.sort(found), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +190,8 @@ def test_delays_agree_with_finer_sections(hopper_cycle, late_input, late_output)
     u = rng.normal(size=(24, 1))
     rest = np.zeros((N + late_input, 1))  # a period before the input begins
     held = np.repeat(u, finer, axis=0)
-    y = np.asarray(fine.simulate(np.concatenate([rest, held])))
+    inputs = np.concatenate([rest, held])
+    y = np.asarray(fine.simulate(inputs))
     expected = y[N - late_output :: finer][: len(u)]
     tolerance = 1e-11 * np.abs(expected).max()
     assert_allclose(model.simulate(u), expected, atol=tolerance)
@@ -231,7 +243,8 @@ MOST = hj.Crossing("v", "rising", 0.8)
     [([HALF, hj.AtEvent("spike")], [0, 1]), ([HALF, MOST], [0, 0]), (HALF, [0])],
 )
 def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, dims):
-    cycle = hj.find_limit_cycle(_Neuron(), hj.Guess("below", (0.5,)))
+    guess = hj.Guess("below", (0.5,))
+    cycle = hj.find_limit_cycle(_Neuron(), guess)
     # The voltage of a section does not change, the current does.
     current = hj.Output("current", lambda t, q, u: 3 * q[0] + 2 * u[0])
     model = hj.linearize(cycle, sections, outputs=current)
@@ -248,7 +261,8 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, di
     closed = model.feedback(np.zeros((1, 1)))
     assert_allclose(closed.simulate(ones), 2 * ones)
 
-    design = hj.multisine(len(dims), 8, inputs="u").scaled(0.01)
+    whole_design = hj.multisine(len(dims), 8, inputs="u")
+    design = whole_design.scaled(0.01)
     data = hj.run_experiments(cycle, sections, design, current, start="periodic")
     assert_allclose(data.y, 2 * data.u, rtol=1e-9)
 
@@ -257,14 +271,17 @@ def test_a_section_map_waits_for_late_arrivals():
     """A ball 3 m/s faster than on the cycle flies for two periods: alone and inside of programs."""
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())
     paddle = hj.sections.section_map(cycle, [hj.AtEvent("impact")], 0, 0)
-    state = np.asarray(paddle.fixed_point) + np.array([0.0, 3.0])
+    fixed = np.asarray(paddle.fixed_point)
+    state = fixed + np.array([0.0, 3.0])
     placed = hj.sections.place_sections(cycle, [hj.AtEvent("impact")])
     begin = float(placed.lanes.t[0])
     path = hj.simulate(cycle.system, "fall", state, 3.0, time=begin)
     alone = paddle(state)
     inside = eqx.filter_jit(paddle)(state)
-    both = jax.vmap(paddle)(np.stack([state, state]))
-    assert float(alone.t) - begin > 1.5 * float(cycle.period)
+    twice = np.stack([state, state])
+    both = jax.vmap(paddle)(twice)
+    duration = float(alone.t) - begin
+    assert duration > 1.5 * float(cycle.period)
     for t in (alone.t, inside.t, both.t[1]):
         assert_allclose(t, path.events[0].time, rtol=1e-9)
 
@@ -277,7 +294,9 @@ def test_second_derivatives_of_a_period():
         return hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), cycle).period
 
     h = 1e-3
-    second = (period(1 + h) - 2 * period(1.0) + period(1 - h)) / h**2
+    middle = 2 * period(1.0)
+    change = period(1 + h) - middle + period(1 - h)
+    second = change / h**2
     exact = jax.jacrev(jax.jacfwd(period))(1.0)
     assert_allclose(exact, second, rtol=1e-5)
     with pytest.raises(hj.errors.DefinitionError, match="jacrev.*jacfwd"):

@@ -25,7 +25,8 @@ def analyze(lossy_cycle, k):
     placed = hj.sections.place_sections(cycle, SECTIONS)
     ldtp = hj.linearize(cycle, placed, outputs="yM")
     P = hj.sections.section_map(cycle, placed, 1, 3)
-    arrival = P(P.fixed_point + 1e-3 * (P.fixed_point != 0), 0.1)
+    push = 1e-3 * (P.fixed_point != 0)
+    arrival = P(P.fixed_point + push, 0.1)
     return {
         "result": cycle.result,
         "states": placed.lanes.q,

@@ -67,15 +67,20 @@ def agrees(system, measure, rtol):
     _, tangents = jax.jvp(at, (0.0,), (1.0,))
     derivative = numbers_of(tangents, shapes)
     h = 2e-4
-    once = numbers_of(at(h), shapes) - numbers_of(at(-h), shapes)
-    twice = numbers_of(at(2 * h), shapes) - numbers_of(at(-2 * h), shapes)
+    ahead = numbers_of(at(h), shapes)
+    behind = numbers_of(at(-h), shapes)
+    once = ahead - behind
+    far_ahead = numbers_of(at(2 * h), shapes)
+    far_behind = numbers_of(at(-2 * h), shapes)
+    twice = far_ahead - far_behind
     difference = (8 * once - twice) / (12 * h)
     tolerance = rtol * np.max(np.abs(derivative))
     assert_allclose(derivative, difference, rtol=rtol, atol=tolerance)
 
     weights = []
     for x in values:
-        weights.append(np.cos(np.arange(np.size(x))).reshape(np.shape(x)))
+        wave = np.cos(np.arange(np.size(x)))
+        weights.append(wave.reshape(np.shape(x)))
     forward = 0.0
     for weight, tangent in zip(weights, tangents, strict=True):
         forward += np.sum(weight * np.asarray(tangent))
@@ -119,7 +124,8 @@ def test_numbers_of_sections(hopper_cycle):
         return hj.linearize(hopper_cycle, sections, "yM").C[0, 0, 0]
 
     e = 1e-4
-    differences = (determinant(e) - determinant(-e)) / (2 * e)
+    change = determinant(e) - determinant(-e)
+    differences = change / (2 * e)
     assert_allclose(jax.grad(determinant)(0.0), differences, rtol=1e-6, atol=1e-9)
 
 
@@ -127,7 +133,8 @@ def test_numbers_of_sections(hopper_cycle):
 def test_a_converter():
     """Events that are scheduled by a parameter."""
     cycle = hj.find_limit_cycle(hj.models.BuckConverter())
-    agrees(cycle.system, measured(cycle, hj.ClockPhase(2, anchor=-0.2)), 1e-8)
+    sections = hj.ClockPhase(2, anchor=-0.2)
+    agrees(cycle.system, measured(cycle, sections), 1e-8)
 
 
 @pytest.mark.slow
@@ -148,8 +155,11 @@ def test_the_multipliers_of_the_hopper_by_its_parameters(hopper_cycle):
         ldtp = hj.linearize(cycle, hj.ClockPhase(8, anchor=APEX), outputs="yM")
         monodromy = ldtp.monodromy(5)
         trace = jax.numpy.trace(monodromy)
-        determinant = (trace**2 - jax.numpy.trace(monodromy @ monodromy)) / 2
-        return jax.numpy.stack([trace / 2, jax.numpy.sqrt(determinant - trace**2 / 4)])
+        square = jax.numpy.trace(monodromy @ monodromy)
+        determinant = (trace**2 - square) / 2
+        distance = determinant - trace**2 / 4
+        root = jax.numpy.sqrt(distance)
+        return jax.numpy.stack([trace / 2, root])
 
     slopes = eqx.filter_jit(eqx.filter_jacfwd(multiplier))(hopper_cycle.system)
     for name, value in true.items():

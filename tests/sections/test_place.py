@@ -64,9 +64,12 @@ def test_the_anchor_lies_on_its_own_section_up_to_rounding(hopper_cycle):
 def test_an_angle_as_the_anchor(hopper_cycle):
     family = hj.KinematicPhase(4, "yM", "vM", (1.9, 0.0), (0.3, 1.9), anchor=0.3)
     placed = hj.sections.place_sections(hopper_cycle, family)
-    height, speed = np.asarray(placed.lanes.q)[:2]
-    angle = np.unwrap(np.arctan2(speed / 1.9, (height - 1.9) / 0.3))
-    expected = 0.3 - np.pi / 2 * np.arange(4)
+    states = np.asarray(placed.lanes.q)
+    height, speed = states[:2]
+    height_in_sizes = (height - 1.9) / 0.3
+    angle = np.unwrap(np.arctan2(speed / 1.9, height_in_sizes))
+    quarters = np.pi / 2 * np.arange(4)
+    expected = 0.3 - quarters
     assert_allclose(angle, expected, atol=1e-10)
 
 
@@ -210,12 +213,15 @@ def test_outputs_of_any_kind_and_feedthrough(
 
     outputs = ["vM", hj.Output("aM", acceleration)]
     ldtp = hj.linearize(hopper_cycle, placed_isochrons, outputs)
-    assert_array_equal(ldtp.C[:, 0], isochron_ldtp.C[:, 1])
+    found = ldtp.C[:, 0]
+    assert_array_equal(found, isochron_ldtp.C[:, 1])
     in_flight = np.asarray(ldtp.dims) == 4
     for section in range(32):
-        assert_allclose(ldtp.D[section, :, 0], [0.0, 0.5], atol=1e-15)
+        direct = ldtp.D[section, :, 0]
+        assert_allclose(direct, [0.0, 0.5], atol=1e-15)
         by_foot = 5.0 if in_flight[section] else 0.0
-        assert_allclose(ldtp.C[section, 1], [-5.0, 0.0, by_foot, 0.0])
+        expected = [-5.0, 0.0, by_foot, 0.0]
+        assert_allclose(ldtp.C[section, 1], expected)
 
 
 def test_ways_that_take_too_many_steps(hopper_cycle, monkeypatch):
@@ -239,13 +245,15 @@ def families_of(cycle):
     for transition in sorted(set(cycle.event_sequence)):
         families.append([AtEvent(structure.transitions[transition].name)])
     for state in names:
-        values = q[:, structure.charts[0].states.index(state)]
+        place = structure.charts[0].states.index(state)
+        values = q[:, place]
         level = 0.53 * values.min() + 0.47 * values.max()
         rising = Crossing(state, "rising", level)
         falling = Crossing(state, "falling", level)
         families.append([rising, falling])
         families.append(hj.ClockPhase(5, falling))
-        families.append(hj.sections.ArcLength(5, names[:1], rising))
+        curve = hj.sections.ArcLength(5, names[:1], rising)
+        families.append(curve)
     if len(names) == 2:
         center = q[:, :2].mean(axis=0)
         families.append(hj.KinematicPhase(9, *names, center=center))
@@ -297,7 +305,9 @@ def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch
         ours, theirs = jax.device_get((turn.lanes, flow.lanes))
         here = belongs(structure, theirs.chart)[:-1]
         scale = np.asarray(cycle.settings.scale)[theirs.chart].T
-        assert_allclose(ours.q / scale, theirs.q / scale, rtol=0, atol=1e-12)
+        our_states = ours.q / scale
+        their_states = theirs.q / scale
+        assert_allclose(our_states, their_states, rtol=0, atol=1e-12)
         assert_allclose(ours.t, theirs.t, rtol=1e-12)
         assert_array_equal(ours.chart, theirs.chart)
         assert_array_equal(ours.events, theirs.events)
@@ -318,7 +328,8 @@ def states_of(tape):
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     (impact, *_) = wheel.trajectory().events
-    at_impact = hj.ClockPhase(2, anchor=float(impact.time / wheel.period))
+    phase = float(impact.time / wheel.period)
+    at_impact = hj.ClockPhase(2, anchor=phase)
     with pytest.raises(
         hj.errors.ComputationError, match="section coincides with an event"
     ):

@@ -50,7 +50,10 @@ def test_a_traced_model_is_that_outside_of_the_program(name, known, no_search):
     traced = eqx.filter_jit(lambda system: model_of(system, known, family))(system)
     d = expected.A.shape[-1]
     # (Inside of programs, matrices are padded to the largest chart.)
-    found = traced.A[:, :d, :d], traced.B[:, :d], traced.C[:, :, :d], traced.D
+    A = traced.A[:, :d, :d]
+    B = traced.B[:, :d]
+    C = traced.C[:, :, :d]
+    found = A, B, C, traced.D
     for matrix, true in zip(found, expected.matrices[:4], strict=True):
         np.testing.assert_allclose(matrix, true, rtol=0, atol=1e-11)
 
@@ -76,7 +79,9 @@ def test_derivatives_of_a_traced_model_are_differences(known, no_search):
     h = 1e-3
     slope = jax.jit(jax.grad(number))(k)
     forwards = jax.jit(jax.jacfwd(number))(k)
-    difference = (number(k + h) - number(k - h)) / (2 * h)
+    higher = number(k + h)
+    change = higher - number(k - h)
+    difference = change / (2 * h)
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
     np.testing.assert_allclose(forwards, slope, rtol=1e-12)
 
@@ -85,7 +90,8 @@ def test_an_event_that_changes_places_with_a_section_is_no_number(known, no_sear
     """A section stays at its height; with another ground, liftoff is on its other side."""
     at_liftoff = hj.sections.place_sections(known, [hj.AtEvent("liftoff")])
     height = float(at_liftoff.observe("yM")[0, 0])
-    family = hj.sections.SectionList([hj.Crossing("yM", "rising", value=height + 1e-3)])
+    just_above = hj.Crossing("yM", "rising", value=height + 1e-3)
+    family = hj.sections.SectionList([just_above])
     traced = eqx.filter_jit(lambda system: model_of(system, known, family))
     assert np.isfinite(traced(HOPPER).A).all()
     beyond = traced(hj.models.VerticalHopper(k=1.2 * HOPPER.k))

@@ -28,7 +28,8 @@ class Mark(eqx.Module):
         return q[0] - self.levels[self.i]
 
     def reset(self, t, q, u):
-        return q.at[2].add(self.weight * 10.0**self.i)
+        change = self.weight * 10.0**self.i
+        return q.at[2].add(change)
 
     def enabled(self, t, q, u):
         return q[2] < 700.0
@@ -86,10 +87,14 @@ def run(system):
 
 
 def test_kinds_are_found():
-    assert Structure(Circle()).kinds == [(0, 2, 4), (1, 3, 5)]
-    assert Structure(Circle(apart=True)).kinds == [(g,) for g in range(6)]
-    assert Structure(hj.models.BouncingChain(n=3)).kinds == [(0, 1, 2)]
-    assert Structure(hj.models.TwoLeggedBar()).kinds == [(g,) for g in range(8)]
+    circle = Structure(Circle())
+    assert circle.kinds == [(0, 2, 4), (1, 3, 5)]
+    apart = Structure(Circle(apart=True))
+    assert apart.kinds == [(g,) for g in range(6)]
+    chain = Structure(hj.models.BouncingChain(n=3))
+    assert chain.kinds == [(0, 1, 2)]
+    bar = Structure(hj.models.TwoLeggedBar())
+    assert bar.kinds == [(g,) for g in range(8)]
 
 
 @pytest.mark.parametrize("other", [Circle(apart=True)])
@@ -97,17 +102,26 @@ def test_events_are_those_of_transitions_of_their_own(other):
     one = run(Circle())
     two = run(other)
     assert len(one.events) == 8
-    assert [e.name for e in one.events] == [e.name for e in two.events]
-    assert_allclose([e.time for e in one.events], [e.time for e in two.events])
-    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
+    names = [e.name for e in one.events]
+    other_names = [e.name for e in two.events]
+    assert names == other_names
+    times = [e.time for e in one.events]
+    other_times = [e.time for e in two.events]
+    assert_allclose(times, other_times)
+    counts = [e.after["n"] for e in one.events]
+    other_counts = [e.after["n"] for e in two.events]
+    assert counts == other_counts
 
 
 def test_numbers_are_those_of_python():
     """In JAX, an integer to the power of one that is negative is another number."""
     one = run(Circle(mark=Halving))
     two = run(Circle(mark=Halving, apart=True))
-    assert [e.after["n"] for e in one.events] == [e.after["n"] for e in two.events]
-    assert set(np.diff([e.after["n"] for e in one.events])) == {1.0, 0.5, 0.25}
+    counts = [e.after["n"] for e in one.events]
+    other_counts = [e.after["n"] for e in two.events]
+    assert counts == other_counts
+    steps = np.diff([e.after["n"] for e in one.events])
+    assert set(steps) == {1.0, 0.5, 0.25}
 
 
 def test_jacobians_are_those_of_each():
@@ -116,6 +130,7 @@ def test_jacobians_are_those_of_each():
         end, lanes, target, done = flow(
             s, 0.0, np.array([*START[:2], 1.0]), np.zeros(s.nu), 3.0
         )
-        jacobian = chain(s, lanes, target, done.tape, of_states=True)[0][0]
+        found = chain(s, lanes, target, done.tape, of_states=True)
+        jacobian = found[0][0]
     assert end[3] == 6.0  # three different factors
     assert_allclose(jacobian[3], [0.0, 0.0, 6.0], atol=1e-12)

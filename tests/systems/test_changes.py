@@ -28,7 +28,8 @@ class Slowed(hj.HybridSystem):
 
     def charts(self):
         def slows(t, q, u):
-            return (drag(q[0]) + jnp.cos(2 * jnp.pi * t) + u[0],)
+            wave = jnp.cos(2 * jnp.pi * t)
+            return (drag(q[0]) + wave + u[0],)
 
         return {"air": Field(("x",), slows)}
 
@@ -43,8 +44,10 @@ def test_a_constant_of_the_notebook_is_changed(monkeypatch):
         model = hj.linearize(cycle, SECTIONS, "x")
         for multipliers in (cycle.multipliers, model.multipliers):
             assert_allclose(multipliers, [np.exp(-value)], rtol=1e-9)
-        end = hj.simulate(Slowed(), "air", (1.0,), 1.0).after[-1]
-        start = hj.simulate(Slowed(), "air", (0.0,), 1.0).after[-1]
+        fall = hj.simulate(Slowed(), "air", (1.0,), 1.0)
+        end = fall.after[-1]
+        rise = hj.simulate(Slowed(), "air", (0.0,), 1.0)
+        start = rise.after[-1]
         assert_allclose(end - start, np.exp(-value), rtol=1e-7)
 
 
@@ -53,7 +56,8 @@ def test_a_constant_of_functions_of_which_a_system_is_made_is_changed(monkeypatc
     start = hj.Guess("main", (1.0,))
     for value in (0.7, 1.3, 0.7):
         monkeypatch.setitem(globals(), "DRAG", value)
-        assert_allclose(hj.flow(slowed, start, 1.0).state, [np.exp(-value)], rtol=1e-9)
+        found = hj.flow(slowed, start, 1.0).state
+        assert_allclose(found, [np.exp(-value)], rtol=1e-9)
         end = hj.simulate(slowed, start, 1.0).after[-1]
         assert_allclose(end, [np.exp(-value)], rtol=1e-7)
 
@@ -116,14 +120,17 @@ def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
     cycle = hj.find_limit_cycle(Slowed())
 
     def decay(wind):
-        ldtp = hj.linearize(eqx.tree_at(lambda x: x.system.wind, cycle, wind), SECTIONS)
+        windy = eqx.tree_at(lambda x: x.system.wind, cycle, wind)
+        ldtp = hj.linearize(windy, SECTIONS)
         return ldtp.A[0, 0, 0]
 
     for transform in (jax.jit, jax.grad, jax.vmap):
         with pytest.raises(hj.errors.DefinitionError, match="find it again"):
-            transform(decay)(jnp.zeros(1 if transform is jax.vmap else ()))
+            shape = 1 if transform is jax.vmap else ()
+            transform(decay)(jnp.zeros(shape))
     model = eqx.filter_jit(hj.linearize)(hj.find_limit_cycle(Slowed()), SECTIONS)
-    assert_allclose(model.A[:, 0, 0], np.exp(-DRAG / 2), rtol=1e-9)
+    expected = np.exp(-DRAG / 2)
+    assert_allclose(model.A[:, 0, 0], expected, rtol=1e-9)
 
 
 def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
@@ -151,7 +158,8 @@ def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
         monkeypatch.setitem(globals(), "DRAG", drag)
         way = hj.simulate(Turns(), "on", (0.0, 0.0), 0.1, input=force)
         ends.append(way.after[-1, 1])
-    assert_allclose(ends[1], ends[0] * 1.3 / 0.7, rtol=1e-2)
+    expected = ends[0] * 1.3 / 0.7
+    assert_allclose(ends[1], expected, rtol=1e-2)
     for use in (lambda: response(DESIGN.signals(cycles=1)), lambda: next(chunks)):
         with pytest.raises(
             hj.errors.DefinitionError,
@@ -168,9 +176,12 @@ class Turns(hj.HybridSystem):
 
     def charts(self):
         def field(t, q, u):
-            pulse = jnp.exp(-(((t % 5.0 - 2.5) / 0.004) ** 2))
-            force = self.push * pulse + (1 + self.gain * pulse) * u[0]
-            return q[1], (1 - q[0] ** 2) * q[1] - q[0] + force
+            distance = (t % 5.0 - 2.5) / 0.004
+            pulse = jnp.exp(-(distance**2))
+            gain = 1 + self.gain * pulse
+            force = self.push * pulse + gain * u[0]
+            damping = (1 - q[0] ** 2) * q[1]
+            return q[1], damping - q[0] + force
 
         return {"on": Field(("x", "v"), field)}
 
@@ -200,7 +211,8 @@ class Pushed(Slowed):
 
     def charts(self):
         def air_rates(t, q, u):
-            return (-q[0] + u[0] * jnp.cos(1.3 * t),)
+            push = u[0] * jnp.cos(1.3 * t)
+            return (-q[0] + push,)
 
         return {"air": Field(("x",), air_rates)}
 
@@ -224,8 +236,10 @@ class Swings(hj.HybridSystem):
 
     def charts(self):
         def field(t, q, u):
-            torque = self.torque * jnp.cos(2 * jnp.pi * t) + u[0]
-            return q[1], -DRAG * q[1] - jnp.sin(q[0]) + torque
+            motor = self.torque * jnp.cos(2 * jnp.pi * t)
+            torque = motor + u[0]
+            gravity = jnp.sin(q[0])
+            return q[1], -DRAG * q[1] - gravity + torque
 
         return {"free": Field(("x", "v"), field)}
 
@@ -332,7 +346,8 @@ def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypa
     response = hj.experiments.response_function(swinging, PLACES, SPEED)
     chunks = hj.run_experiments(swinging, PLACES, PUSHES, SPEED, chunk=1)
     placed = hj.sections.place_sections(swinging, hj.ClockPhase(2, anchor=level))
-    before = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
+    model = hj.linearize(swinging, PLACES, SPEED)
+    before = model.C[0, 0, 0]
     monkeypatch.setitem(globals(), "GAIN", 2.0)
     uses = {
         "Output 'speed' has changed since this response function was made": (
@@ -348,5 +363,6 @@ def test_outputs_and_sections_that_are_functions_are_compared(swinging, monkeypa
     for sentence, use in uses.items():
         with pytest.raises(hj.errors.DefinitionError, match=sentence):
             use()
-    after = hj.linearize(swinging, PLACES, SPEED).C[0, 0, 0]
+    model_after = hj.linearize(swinging, PLACES, SPEED)
+    after = model_after.C[0, 0, 0]
     assert_allclose(after, 2 * before, rtol=1e-12)

@@ -15,7 +15,8 @@ from ..toys import Field, toy
 def test_a_network_and_a_scan():
     """x' = -x + network(x, cos t) + a polynomial in x, computed by a scan; against the same in
     NumPy, integrated by scipy; the multiplier by the divergence."""
-    network = eqx.nn.MLP(2, 1, 4, 1, activation=jnp.tanh, key=jax.random.key(1))
+    key = jax.random.key(1)
+    network = eqx.nn.MLP(2, 1, 4, 1, activation=jnp.tanh, key=key)
     coefficients = jnp.array([-0.1, 0.2, 0.3])
 
     def learned(t, q, u):
@@ -25,10 +26,12 @@ def test_a_network_and_a_scan():
             return (value * x + coefficient, None)
 
         polynomial, _ = jax.lax.scan(horner, 0.0 * x, coefficients)
-        output = network(jnp.stack([x, jnp.cos(t)]))[0]
+        state = jnp.stack([x, jnp.cos(t)])
+        output = network(state)[0]
         return (-x + output + polynomial + u[0],)
 
-    system = toy({"a": Field(("x",), learned)}, period=2 * np.pi)
+    charts = {"a": Field(("x",), learned)}
+    system = toy(charts, period=2 * np.pi)
     cycle = hj.find_limit_cycle(system, hj.Guess("a", (0.3,)))
 
     first, second = network.layers
@@ -38,11 +41,17 @@ def test_a_network_and_a_scan():
     def rates(t, state):
         """Of x, and of the logarithm of a deviation."""
         x = state[0]
-        hidden = np.tanh(W @ [x, np.cos(t)] + np.asarray(first.bias))
+        before = W @ [x, np.cos(t)]
+        hidden = np.tanh(before + np.asarray(first.bias))
         output = V @ hidden + np.asarray(second.bias)
-        slope = V @ ((1 - hidden**2) * W[:, 0])
-        polynomial = -0.1 * x**2 + 0.2 * x + 0.3
-        return [-x + output[0] + polynomial, -1 + slope[0] - 0.2 * x + 0.2]
+        slope_of_tanh = 1 - hidden**2
+        by_hidden = slope_of_tanh * W[:, 0]
+        slope = V @ by_hidden
+        square = -0.1 * x**2
+        polynomial = square + 0.2 * x + 0.3
+        rate = -x + output[0] + polynomial
+        by_x = -1 + slope[0] - 0.2 * x + 0.2
+        return [rate, by_x]
 
     start = cycle.state["x"]
     path = solve_ivp(

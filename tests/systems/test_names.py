@@ -20,7 +20,10 @@ class Plane(hj.Chart):
     def field(self, t, q, u):
         x, y = q
         growth = 1 - x**2 - y**2
-        return growth * x - ANGULAR * y + u[0], growth * y + ANGULAR * x
+        turn = ANGULAR * y
+        x_rate = growth * x - turn + u[0]
+        y_rate = growth * y + ANGULAR * x
+        return x_rate, y_rate
 
 
 class Oscillator(hj.HybridSystem):
@@ -69,7 +72,8 @@ def test_the_default_input_yields_to_a_state_of_its_name():
     # At the angle a of the unit circle, the angle changes by -sin(a) dx + cos(a) du.
     angle = 2 * np.pi * phase - np.pi / 2
     assert_allclose(responses["u"], np.cos(angle) / ANGULAR, atol=1e-9)
-    assert_allclose(responses["input"], -np.sin(angle) / ANGULAR, atol=1e-9)
+    expected_input = -np.sin(angle) / ANGULAR
+    assert_allclose(responses["input"], expected_input, atol=1e-9)
     assert_allclose(responses["u"], expected["u"], rtol=1e-12)
     # White noise of the state and of the input are two things, with equal effects here.
     diffusion = PUSH**2 / 2 / ANGULAR**2

@@ -12,7 +12,8 @@ class Ball(hj.Chart):
     owner: "Bouncing"
 
     def field(self, t, q, u):
-        return q[1], -9.81 + u[0] / self.owner.m
+        push = u[0] / self.owner.m
+        return q[1], -9.81 + push
 
 
 class Bouncing(hj.HybridSystem):
@@ -38,7 +39,8 @@ def test_masses_must_be_positive(mass):
     hoppers = eqx.filter_vmap(lambda m: hj.models.VerticalHopper(M=m))
     cycle = hj.find_limit_cycle(hj.models.VerticalHopper())
     says = rf"parameter `M` of VerticalHopper is {mass:g}"
-    refused(says, hj.orbits.find_limit_cycles, hoppers(jnp.array([2.0, mass])), cycle)
+    wrong = hoppers(jnp.array([2.0, mass]))
+    refused(says, hj.orbits.find_limit_cycles, wrong, cycle)
     refused("must be positive|`M` must be", hj.continuation, cycle, "M", (2.0, mass))
 
 

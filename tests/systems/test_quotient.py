@@ -26,15 +26,20 @@ class Stands(hj.Chart):
 
     def field(self, t, q, u):
         step = self.walker.charts()["step"]
-        a, b, w, v = step.field(t, seen(q, self.leg), u)
-        rate = jnp.cos(q[self.leg]) * q[2 + self.leg] - self.drag * q[4]
+        state = seen(q, self.leg)
+        a, b, w, v = step.field(t, state, u)
+        cosine = jnp.cos(q[self.leg])
+        swing = cosine * q[2 + self.leg]
+        rate = swing - self.drag * q[4]
         return told(self.leg, a, b, w, v, rate)
 
 
 def seen(q, leg):
     """As the model has it: the stance leg, and the angle between both."""
     other = 1 - leg
-    return q[leg], q[leg] - q[other], q[2 + leg], q[2 + leg] - q[2 + other]
+    angle = q[leg] - q[other]
+    rate = q[2 + leg] - q[2 + other]
+    return q[leg], angle, q[2 + leg], rate
 
 
 def told(leg, th, phi, w, p, x):
@@ -70,7 +75,8 @@ class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
 
     def guess(self):
         th, phi, w, p = hj.models.SimplestWalker().guess().state
-        return hj.Guess("left stands", told(0, th, phi, w, p, 0.0))
+        state = told(0, th, phi, w, p, 0.0)
+        return hj.Guess("left stands", state)
 
 
 FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})
@@ -89,7 +95,8 @@ def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section
     walker = hj.systems.Symmetric(Full(), **symmetry, translation=("x",))
     cycle = hj.find_limit_cycle(walker, section=section)
     assert_allclose(cycle.period, steps * 3.88246375285137, rtol=1e-10)
-    expected = np.sort_complex(np.array([LONG_GAIT, np.conj(LONG_GAIT)]) ** steps)
+    pair = np.array([LONG_GAIT, np.conj(LONG_GAIT)])
+    expected = np.sort_complex(pair**steps)
     assert_allclose(np.sort_complex(cycle.multipliers), expected, rtol=1e-9)
 
 
@@ -125,7 +132,8 @@ def test_an_odd_oscillator_closes_after_half_a_period():
     at = hj.AtEvent("half period")
     whole = hj.find_limit_cycle(pol, section=hj.Crossing("x", "falling"))
     folded = hj.systems.Symmetric(pol, flipped=("x", "v"), half_period="x")
-    half = hj.find_limit_cycle(folded, hj.Guess("oscillation", (0.0, -1.9)), section=at)
+    guess = hj.Guess("oscillation", (0.0, -1.9))
+    half = hj.find_limit_cycle(folded, guess, section=at)
     assert_allclose(2 * half.period, whole.period, rtol=1e-11)
     assert_allclose(half.multipliers**2, whole.multipliers, rtol=1e-9)
     with pytest.raises(
@@ -204,7 +212,8 @@ def test_scheduled_switches_close_after_half_a_period():
     whole = hj.find_limit_cycle(Inverter())
     assert_allclose(2 * half.period, whole.period, rtol=1e-12)
     assert_allclose(half.state["i"], whole.state["i"], rtol=1e-11)
-    assert_allclose(half.multipliers[0] ** 2, whole.multipliers[0], rtol=1e-10)
+    square = half.multipliers[0] ** 2
+    assert_allclose(square, whole.multipliers[0], rtol=1e-10)
     assert [half.structure.transitions[g].name for g in half.event_sequence][
         0
     ] == "down"

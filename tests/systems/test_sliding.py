@@ -20,14 +20,17 @@ def test_a_block_on_a_belt_sticks_and_slips():
     decay = 3.0
 
     def slip(t, q):
-        return [q[1], -q[0] + F / (1 + decay * (belt - q[1]))]
+        behind = belt - q[1]
+        friction = F / (1 + decay * behind)
+        return [q[1], -q[0] + friction]
 
     def caught(t, q):
         return q[1] - belt
 
     caught.direction, caught.terminal = 1, True
     options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14}
-    begin = solve_ivp(slip, (0, 0.5), [F, belt], **options).y[:, -1]
+    path = solve_ivp(slip, (0, 0.5), [F, belt], **options)
+    begin = path.y[:, -1]
     way = solve_ivp(slip, (0.5, 20), begin, events=caught, **options)
     t = way.t_events[0][0]
     (x, _) = way.y_events[0][0]
@@ -69,7 +72,8 @@ def test_it_slides_or_crosses(push, end, chart):
     parts = hj.systems.filippov(
         {"up": field(0.5, -1.0), "down": field(2.0, push)}, height
     )
-    way = hj.simulate(toy(parts.charts, parts.transitions), "up", (0.0, 1.0), 2.0)
+    system = toy(parts.charts, parts.transitions)
+    way = hj.simulate(system, "up", (0.0, 1.0), 2.0)
     assert_allclose(way.after[-1], end, atol=1e-9)
     assert way.chart[-1] == chart
 

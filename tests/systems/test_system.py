@@ -48,7 +48,8 @@ def test_parameters_are_arrays_that_can_be_mapped_and_differentiated():
     assert hopper.M == 3.0
     assert hopper.M.dtype == np.float64
     period = eqx.filter_grad(lambda h: h.period())(hopper)
-    assert_allclose(period.omega, -1 / (2 * np.pi), rtol=1e-14)
+    expected = -1 / (2 * np.pi)
+    assert_allclose(period.omega, expected, rtol=1e-14)
     many = eqx.filter_vmap(lambda M: hj.models.VerticalHopper(M=M))(
         jnp.arange(1.0, 4.0)
     )

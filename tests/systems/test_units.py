@@ -15,7 +15,8 @@ def units(names):
 
 
 def small_htf(**names):
-    return hj.linear.HTF([0.1, 0.2], np.ones((1, 2, 1, 1)), 0, 8, **names)
+    values = np.ones((1, 2, 1, 1))
+    return hj.linear.HTF([0.1, 0.2], values, 0, 8, **names)
 
 
 def test_units_go_from_the_model_to_the_fit(kinematic_ldtp, tmp_path):
@@ -46,7 +47,8 @@ def test_what_has_other_units_is_not_compared():
         hj.errors.DefinitionError, match=r"\('y' \(m\),\) and \('y' \(mm\),\)"
     ):
         small_htf(outputs={"y": "m"}).error(small_htf(outputs={"y": "mm"}))
-    assert small_htf(outputs={"y": "m"}).error(small_htf(outputs="y")) == 0
+    in_meters = small_htf(outputs={"y": "m"})
+    assert in_meters.error(small_htf(outputs="y")) == 0
 
 
 def test_units_that_do_not_fit_are_refused():

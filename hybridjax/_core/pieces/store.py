@@ -55,7 +55,8 @@ class Blocks:
         sides = zip(self.place(k), self.block, self.shape, strict=True)
         slices = []
         for i, b, n in sides:
-            slices.append(slice(i * b, min((i + 1) * b, n)))
+            end = min((i + 1) * b, n)
+            slices.append(slice(i * b, end))
         return tuple(slices)
 
 
@@ -268,7 +269,8 @@ class ZarrStore:
             raise FileFormatError(f"'{self.address}' is damaged: {error}") from error
         # (Zarr lists arrays in any order.)
         dims = [name for name in self.layout.dims if name in data.coords]
-        beside = sorted({*data.coords, *data.data_vars} - {*dims, *self._arrays})
+        known = {*dims, *self._arrays}
+        beside = sorted({*data.coords, *data.data_vars} - known)
         description = json.dumps(self.layout.description)
         return data[[*dims, *self._arrays, *beside]].assign_attrs({_ABOUT: description})
 
@@ -360,7 +362,8 @@ def make_store(address: str, layout: Layout, start: list[np.ndarray]) -> ZarrSto
             constant(group, name, *x)
         kept = group.require_group(_START)
         for i, x in enumerate(start):
-            constant(kept, f"{i}", [f"axis_{j}" for j in range(np.ndim(x))], x)
+            axes = [f"axis_{j}" for j in range(np.ndim(x))]
+            constant(kept, f"{i}", axes, x)
         dims = {name: tuple(x[0]) for name, x in layout.constants.items()}
         beside = [name for name in layout.coordinates if dims[name] != (name,)]
         if beside:

@@ -100,7 +100,9 @@ def _eliminated(matrix, right):
 
     for k in range(n):
         for i in range(k + 1, n):
-            upper, lower = _larger_first(rows[k][k:], rows[i][k:])
+            above = rows[k][k:]
+            below = rows[i][k:]
+            upper, lower = _larger_first(above, below)
             pivot = upper[0]
             share = lower[0] / jnp.where(pivot == 0, 1.0, pivot)
             rows[k][k:] = upper
@@ -168,7 +170,8 @@ def cholesky(matrix: Float[Array, "*b n n"]) -> Float[Array, "*b n n"]:
     lower = [[zero] * n for _ in range(n)]
     for j in range(n):
         for i in range(j, n):
-            products = list(zip(lower[i][:j], lower[j][:j], strict=True))
+            pairs = zip(lower[i][:j], lower[j][:j], strict=True)
+            products = list(pairs)
             lower[i][j] = _less(matrix[..., i, j], products)
         pivot = lower[j][j]
         root = jnp.sqrt(jnp.where(pivot > 0, pivot, jnp.nan))

@@ -112,7 +112,9 @@ def _row_by_row(program: Program) -> Program:
 
 @jax.jit
 def _rows(*parts):
-    rows = jnp.zeros(sum(x.size for x in parts), jnp.result_type(*parts))
+    count = sum(x.size for x in parts)
+    kind = jnp.result_type(*parts)
+    rows = jnp.zeros(count, kind)
     start = 0
     for part in map(jnp.atleast_1d, parts):
         rows = jax.lax.dynamic_update_slice(rows, part, (start,))

@@ -97,14 +97,16 @@ def _sincos(x):
     b = k * n.pi_2[1]
     r = a - b
     lost = (a - r) - b  # by rounding
-    r = (r + (lost - k * n.pi_2[2])) - k * n.pi_2[3]
+    third = lost - k * n.pi_2[2]
+    r = (r + third) - k * n.pi_2[3]
     # Acts from |x| ~ 1e14 on only, where x does not determine r any more.
     low = jax.lax.full_like(r, -0.8)
     high = jax.lax.full_like(r, 0.8)
     r = jax.lax.clamp(low, r, high)
     z = r * r
     s = r + r * z * _polynomial(n.sin, z)
-    c = 1 - (0.5 * z - z * z * _polynomial(n.cos, z))
+    higher = z * z * _polynomial(n.cos, z)
+    c = 1 - (0.5 * z - higher)
     quadrant = k - 4 * jax.lax.floor(0.25 * k)
     odd = abs(quadrant - 2) == 1
     sin = jax.lax.select(odd, c, s)
@@ -135,7 +137,8 @@ def _arctan2(y, x):
     r = jax.lax.select(steep, (ratio - 1) / (ratio + 1), ratio)
     z = r * r
     angle = r + r * z * _polynomial(n.arctan, z)
-    angle = jax.lax.select(steep, jnp.pi / 4 + (angle + n.pi_4_low), angle)
+    beyond = jnp.pi / 4 + (angle + n.pi_4_low)
+    angle = jax.lax.select(steep, beyond, angle)
     beyond_diagonal = jnp.pi / 2 - (angle - 2 * n.pi_4_low)
     angle = jax.lax.select(ay > ax, beyond_diagonal, angle)
     left = jnp.pi - (angle - 4 * n.pi_4_low)

@@ -146,7 +146,8 @@ class Bodies:
             branches.append(ft.partial(self._step, motion, row))
         if does & {JUMP, LEVEL}:
             branches.append(ft.partial(self._end, motion, row))
-        return chosen(row.ends_leg.astype(int), branches, course, flags, (now, due))
+        which = row.ends_leg.astype(int)
+        return chosen(which, branches, course, flags, (now, due))
 
     # Stages, and numbers of rows.
 
@@ -179,7 +180,8 @@ class Bodies:
         guard = s.transitions[g].guard
         assert isinstance(guard, Scheduled)
         tick = guard.nearest(course.ends[row.leg])
-        return course._replace(ends=course.ends.at[row.leg].set(tick)), flags
+        ends = course.ends.at[row.leg].set(tick)
+        return course._replace(ends=ends), flags
 
     def _time(self, row: Row, s: Structure, _, course: Course, flags: Flags):
         """The arrival at a time that is known."""
@@ -195,7 +197,8 @@ class Bodies:
     ):
         """The field of chart a, and its watched functions, which had values `before`."""
         q = _state(s, a, course)
-        t, u = course.t, jnp.zeros(s.nu)
+        t = course.t
+        u = jnp.zeros(s.nu)
         field = steps.field(s, a, t, q)
         field_before = course.rate
         course = course._replace(rate=_padded(field, course.rate))
@@ -206,7 +209,8 @@ class Bodies:
         def values(t, q):
             return watched(s, a, constants.levels, row, t, q, u)
 
-        value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), field))
+        along = (jnp.ones_like(t), field)
+        value, rate = jax.jvp(values, (t, q), along)
         course = course._replace(value=value[row.target], slope=rate[row.target])
         more = self.form.watched - len(value)
         # (Rates of what is not watched are 1: nothing divides by zero.)
@@ -215,7 +219,8 @@ class Bodies:
         enabled = jnp.ones(self.form.watched, bool)
         now = still(Watched(t, value, rate, enabled, ~enabled, padded))
         fields = still((field_before, course.rate))
-        return course, _with_predicates(a, s, before, now, fields)
+        now = _with_predicates(a, s, before, now, fields)
+        return course, now
 
     def _noted(self, row: Row, s: Structure, _, flags: Flags, seen):
         """The flags, and the guards that are due."""
@@ -227,7 +232,8 @@ class Bodies:
 
     def _step(self, motion: Motion, row: Row, course, flags: Flags, _):
         """A part of the leg, or a Newton step on a watched function."""
-        course, _ = motion.apply(self._lane(self._departed, row), course, None)
+        departed = self._lane(self._departed, row)
+        course, _ = motion.apply(departed, course, None)
         moving, error = self._advanced(motion, row, course)
         course, _ = motion.apply(_after_step, moving, None)
         flags = flags._replace(error=jnp.maximum(flags.error, error))
@@ -244,10 +250,14 @@ class Bodies:
         if self.inputs is None:
             unit = jnp.eye(C, d)
         else:
-            unit = jnp.concatenate([-course.rate[None], jnp.eye(C - 1, d)])
+            by_time = -course.rate[None]
+            by_state = jnp.eye(C - 1, d)
+            unit = jnp.concatenate([by_time, by_state])
             delay = delay.at[0].set(1.0)
-        dims = jnp.asarray([s.dims[a] for a in self.form.charts])
-        unit = jnp.where(jnp.arange(d) < dims[row.chart], unit, 0.0)
+        counts = [s.dims[a] for a in self.form.charts]
+        dims = jnp.asarray(counts)
+        is_used = jnp.arange(d) < dims[row.chart]
+        unit = jnp.where(is_used, unit, 0.0)
         begins = row.piece < self.form.pieces
         columns = jnp.where(begins, unit, course.y[1:])
         h = row.fraction * (course.ends[row.leg] - course.begin)
@@ -266,26 +276,32 @@ class Bodies:
         """The course with the state and its columns after a step, and the error of the state
         relative to what is allowed."""
         charts = self.form.charts
-        solvers = list(dict.fromkeys(self.solver(a) for a in charts))
+        solver_of = [self.solver(a) for a in charts]
+        solvers = list(dict.fromkeys(solver_of))
         branches = [ft.partial(self._advanced_by, x, motion, row) for x in solvers]
-        number = jnp.asarray([solvers.index(self.solver(a)) for a in charts])
+        number = jnp.asarray([solvers.index(x) for x in solver_of])
         y, error = chosen(number[row.chart], branches, course)
         settings = motion.constants.settings
-        assert settings.scale is not None and settings.rtol is not None
-        scale = jnp.asarray(settings.scale)[jnp.asarray(charts)][row.chart]
+        assert settings.scale is not None
+        assert settings.rtol is not None
+        scales = jnp.asarray(settings.scale)[jnp.asarray(charts)]
+        scale = scales[row.chart]
         begin = motion.values(course).y[..., 0, :]
         end = motion.values(y)[..., 0, :]
-        allowed = settings.rtol * jnp.maximum(jnp.abs(begin), jnp.abs(end))
+        larger = jnp.maximum(jnp.abs(begin), jnp.abs(end))
+        allowed = settings.rtol * larger
         allowed = allowed + settings.atol * scale
         # (Numbers that a chart does not use have no error.)
-        relative = jnp.where(error == 0, 0.0, jnp.abs(error) / allowed)
+        part = jnp.abs(error) / allowed
+        relative = jnp.where(error == 0, 0.0, part)
         error = still(jnp.max(relative, axis=-1, initial=0.0))
         return motion.join(course, y), error
 
     def _advanced_by(self, solver: steps.Solver, motion: Motion, row: Row, course):
         """The state and its columns after a step of one of the solvers, and the error."""
         charts = [a for a in self.form.charts if self.solver(a) == solver]
-        places = [charts.index(a) if a in charts else 0 for a in self.form.charts]
+        all_charts = self.form.charts
+        places = [charts.index(a) if a in charts else 0 for a in all_charts]
         place = jnp.asarray(places)[row.chart]
         if steps.is_implicit(solver):
             stages = [self._lane(self._implicit_step, solver, a) for a in charts]
@@ -301,13 +317,16 @@ class Bodies:
 
         begin = motion.pack(motion.part(course, "y"))
         y, error = steps.unit_step(solver, packed_rates, begin)
-        return motion.unpack(y), motion.values(motion.unpack(error))[..., 0, :]
+        end = motion.unpack(y)
+        of_state = motion.values(motion.unpack(error))[..., 0, :]
+        return end, of_state
 
     def _rates(self, a: int, part, s: Structure, _, moving, notes):
         """Rates of the state and of its columns within a step of chart a."""
         course, y = moving
         t = course.t + part * course.h
-        rates = steps.rates(s, a, t, y[:, : s.dims[a]], self.inputs)
+        used = y[:, : s.dims[a]]
+        rates = steps.rates(s, a, t, used, self.inputs)
         return _padded(course.h * rates, y), notes
 
     def _implicit_step(self, method, a: int, s: Structure, _, course: Course, notes):
@@ -316,7 +335,8 @@ class Bodies:
         end, error = steps.implicit_step(
             s, a, method, course.t, y, course.h, self.inputs
         )
-        return _padded(end, course.y), _padded(still(error), course.y[0])
+        state = course.y[0]
+        return _padded(end, course.y), _padded(still(error), state)
 
     # Ends of legs.
 
@@ -324,16 +344,19 @@ class Bodies:
         """The event, or the arrival on a level, with which a leg ends."""
         now, due = seen
         course, _ = self._in_chart(motion, row, self._aimed, course)
-        course, _ = motion.apply(self._lane(self._shifted), course, None)
+        shifted = self._lane(self._shifted)
+        course, _ = motion.apply(shifted, course, None)
         flags = self._without_tick(motion, row, course, flags)
         kinds = self.form.kinds
         stages = [self._lane(self._reset, kind, row) for kind in kinds]
         if any(body.does == LEVEL for body in self.form.bodies):
             stages.append(lambda _, course, notes: (course, notes))
         jumping = Jumping(due, flags.entry, disabled=jnp.zeros_like(flags.left))
-        course, (_, jumping) = choose(motion, row.kind, stages, course, (now, jumping))
+        found = (now, jumping)
+        course, (_, jumping) = choose(motion, row.kind, stages, course, found)
         ended = self._lane(self._ended, row)
-        course, (flags, *_) = motion.apply(ended, course, (flags, now, jumping))
+        seen_there = (flags, now, jumping)
+        course, (flags, *_) = motion.apply(ended, course, seen_there)
         return course, flags
 
     def _aimed(self, a: int, row: Row, s: Structure, constants, course: Course, notes):
@@ -343,17 +366,20 @@ class Bodies:
         course = course._replace(h=jnp.zeros(()), delay=delay)
         if not count_watched(s, a, constants.levels):
             return course, notes
-        q, u = _state(s, a, course), jnp.zeros(s.nu)
+        q = _state(s, a, course)
+        u = jnp.zeros(s.nu)
 
         def values(q, u):
             return watched(s, a, constants.levels, row, course.t, q, u)
 
         def along(v, w=u):
-            return jax.jvp(values, (q, u), (v, w))[1][row.target]
+            _, changes = jax.jvp(values, (q, u), (v, w))
+            return changes[row.target]
 
         aims = row.target >= 0
         slope = jnp.where(aims, course.slope, 1.0)
-        delay = -self._each(along, course.y[1:, : s.dims[a]]) / slope
+        columns = course.y[1:, : s.dims[a]]
+        delay = -self._each(along, columns) / slope
         course = course._replace(
             h=jnp.where(aims, -course.value / slope, 0.0),
             delay=jnp.where(aims, delay, course.delay),
@@ -362,29 +388,38 @@ class Bodies:
 
     def _shifted(self, s: Structure, _, course: Course, notes):
         """The state when the leg ends, and its columns at that time."""
-        moved = jnp.outer(jnp.append(course.h, course.delay), course.rate)
-        return course._replace(t=course.t + course.h, y=course.y + moved), notes
+        later = jnp.append(course.h, course.delay)
+        moved = jnp.outer(later, course.rate)
+        course = course._replace(t=course.t + course.h, y=course.y + moved)
+        return course, notes
 
     def _reset(
         self, kind: Kind, row: Row, s: Structure, constants, course: Course, notes
     ):
         """The state and its columns after a jump, at a fixed time again."""
         tr = s.transitions[kind[0]]
-        a, b = s.chart_index(tr.source), s.chart_index(tr.target)
+        a = s.chart_index(tr.source)
+        b = s.chart_index(tr.target)
         member = Member(kind, row.place)
-        t, q, u = course.t, _state(s, a, course), jnp.zeros(s.nu)
-        notes = self._jumping(a, b, member, row, s, constants, still((t, q)), notes)
+        t = course.t
+        q = _state(s, a, course)
+        u = jnp.zeros(s.nu)
+        at = still((t, q))
+        notes = self._jumping(a, b, member, row, s, constants, at, notes)
 
         def reset(t, q, u):
             return s.reset(member, t, q, u)
 
         after = reset(t, q, u)
-        onward = jnp.where(row.onward, steps.field(s, b, t, after), 0.0)
+        rate_after = steps.field(s, b, t, after)
+        onward = jnp.where(row.onward, rate_after, 0.0)
 
         def column(v, delay, w=u):
-            return jax.jvp(reset, (t, q, u), (delay, v, w))[1] - onward * delay
+            _, change = jax.jvp(reset, (t, q, u), (delay, v, w))
+            return change - onward * delay
 
-        columns = self._each(column, course.y[1:, : s.dims[a]], course.delay)
+        before = course.y[1:, : s.dims[a]]
+        columns = self._each(column, before, course.delay)
         y = jnp.concatenate([after[None], columns])
         return course._replace(y=_padded(y, course.y)), notes
 
@@ -397,7 +432,8 @@ class Bodies:
         pending = (now.value > 0) | jumping.due
         pending = pending & (jnp.arange(self.form.watched) != row.target)
         entry = entered(s, a, b, constants.levels, row, t, q, pending)
-        disabled = ~s.enabled(member, t, q, jnp.zeros(s.nu))
+        no_input = jnp.zeros(s.nu)
+        disabled = ~s.enabled(member, t, q, no_input)
         return now, jumping._replace(entry=entry, disabled=disabled)
 
     def _ended(self, row: Row, s: Structure, _, course: Course, notes):
@@ -457,13 +493,17 @@ def _with_predicates(
     enabled_at_zero = jnp.asarray(now.enabled_at_zero)
     for place, g in predicates:
         values = before.value[place], now.value[place]
-        slopes = h * before.rate[place], h * now.rate[place]
+        slope_before = h * before.rate[place]
+        slope_after = h * now.rate[place]
+        slopes = slope_before, slope_after
         zero = root_near_end(*values, *slopes)
         # (NaN where nothing is known of the time before.)
         x = jnp.clip(jnp.nan_to_num(zero, nan=1.0), 0.0, 1.0)
         state = interpolate(x, h, before.q, now.q, *fields)
-        holds = s.enabled(g, before.t + x * h, state[:n], u)
-        enabled = enabled.at[place].set(s.enabled(g, now.t, now.q[:n], u))
+        time = before.t + x * h
+        holds = s.enabled(g, time, state[:n], u)
+        holds_now = s.enabled(g, now.t, now.q[:n], u)
+        enabled = enabled.at[place].set(holds_now)
         enabled_at_zero = enabled_at_zero.at[place].set(holds)
     return now._replace(enabled=enabled, enabled_at_zero=enabled_at_zero)
 
@@ -473,7 +513,8 @@ def _padded(
 ) -> Float[Array, "*C d"]:
     """`x` with zeros for numbers that a chart does not use."""
     more = like.shape[-1] - x.shape[-1]
-    return jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, more)]) if more else x
+    kept = [(0, 0)] * (x.ndim - 1)
+    return jnp.pad(x, kept + [(0, more)]) if more else x
 
 
 def _after_step(_, moving, notes):
@@ -489,7 +530,8 @@ def _arrived(row: Row, course: Course, flags: Flags, late):
         last=jnp.maximum(flags.last, jnp.abs(still(late))),
         left=flags.left | still(t < course.begin),
     )
-    return course._replace(begin=t, ends=course.ends.at[row.leg].set(t)), flags
+    ends = course.ends.at[row.leg].set(t)
+    return course._replace(begin=t, ends=ends), flags
 
 
 def _has_tick(a: int, row: Row, s: Structure, _, left, passed):

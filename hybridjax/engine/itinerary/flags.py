@@ -90,7 +90,8 @@ def watched(
     """The watched functions of chart a: its guards, and the level of the row's section."""
     from ..kernels import watched_at
 
-    return watched_at(a, s.guard_kinds(a), s, levels, t, q, u, row.section)
+    kinds = s.guard_kinds(a)
+    return watched_at(a, kinds, s, levels, t, q, u, row.section)
 
 
 def count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
@@ -103,19 +104,24 @@ def noted(
 ) -> tuple[Flags, Bool[Array, " G"]]:
     """The flags at a row, where watched functions have these values, and the guards that are due
     there. `duration`: of the leg."""
-    guards = jnp.asarray([len(s.guards(a)) for a in form.charts])
-    is_guard = jnp.arange(form.watched) < guards[row.chart]
+    counts = [len(s.guards(a)) for a in form.charts]
+    guards = jnp.asarray(counts)[row.chart]
+    is_guard = jnp.arange(form.watched) < guards
     due = is_guard & _is_due(flags, now, duration)
     is_new = due.any() & ~row.at_once
     lost = row.at_once & ~row.scheduled
     if due.size:
         lost = lost & ~due[_fired(form, s, row)]
-    left = flags.left | is_new | lost | _has_left(row, flags.before, now)
+    has_left = _has_left(row, flags.before, now)
+    left = flags.left | is_new | lost | has_left
     # (Where a reset puts the state on a guard, rounding gives this guard a sign. It does not fall
     # through its zero there, as it did not on the recorded trajectory.)
-    at_zero = jnp.abs(now.value) <= SAME_TIME * duration * jnp.abs(now.rate)
-    value = jnp.where((row.signs == 0) & at_zero, 0.0, now.value)
-    return flags._replace(before=now._replace(value=value), left=left), due
+    zero = SAME_TIME * duration * jnp.abs(now.rate)
+    at_zero = jnp.abs(now.value) <= zero
+    on_guard = (row.signs == 0) & at_zero
+    value = jnp.where(on_guard, 0.0, now.value)
+    before = now._replace(value=value)
+    return flags._replace(before=before, left=left), due
 
 
 def _is_due(flags: Flags, now: Watched, duration) -> Bool[Array, " G"]:
@@ -125,7 +131,9 @@ def _is_due(flags: Flags, now: Watched, duration) -> Bool[Array, " G"]:
     begins = jnp.isinf(flags.before.value)
     falls = now.rate < 0
     beyond = now.value < -SAME_TIME * duration * jnp.abs(now.rate)
-    crossed = (falls & ~entry.known) | (entry.armed & (falls | beyond))
+    is_new = falls & ~entry.known
+    was_to_fall = entry.armed & (falls | beyond)
+    crossed = is_new | was_to_fall
     return begins & (now.value < 0) & crossed & now.enabled
 
 
@@ -133,12 +141,14 @@ def _fired(form: Form, s: Structure, row: Row) -> Int[Array, ""]:
     """The place of the guard of a jump among those of its chart."""
     places = []
     for kind in form.kinds:
-        guards = s.guards(s.chart_index(s.transitions[kind[0]].source))
+        source = s.transitions[kind[0]].source
+        guards = s.guards(s.chart_index(source))
         places.append([guards.index(g) if g in guards else 0 for g in kind])
-    most = max(map(len, places), default=1)
-    table = [x + [0] * (most - len(x)) for x in places]
-    # (The last one is for rows that are no jump.)
-    return jnp.asarray([*table, [0] * most])[row.kind, row.place]
+        most = max(map(len, places), default=1)
+        table = [x + [0] * (most - len(x)) for x in places]
+        # (The last row is for rows that are no jump.)
+        table.append([0] * most)
+        return jnp.asarray(table)[row.kind, row.place]
 
 
 def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
@@ -161,7 +171,8 @@ def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
     other = begins & compared & ~as_recorded
     unknown = within & ~jnp.isfinite(now.value)
     returns = within & dips(before, now, signs)
-    falls = within & (before.value > 0) & ~(now.value > 0)
+    was_positive = before.value > 0
+    falls = within & was_positive & ~(now.value > 0)
     enabled = before.enabled | now.enabled | now.enabled_at_zero
     happens = falls & enabled
     left = (other | unknown | returns | happens).any()
@@ -210,16 +221,19 @@ def entered(
     width = len(pending)
     if a == b:
         return Entry(jnp.ones(width, bool), pending)
-    if s.dims[a] != s.dims[b] or not (s.guards(a) and s.guards(b)):
+    have_guards = s.guards(a) and s.guards(b)
+    if s.dims[a] != s.dims[b] or not have_guards:
         return Entry.unknown(width)
 
     def values(chart, q):
-        functions = watched(s, chart, levels, row, t, q, jnp.zeros(s.nu))
+        no_input = jnp.zeros(s.nu)
+        functions = watched(s, chart, levels, row, t, q, no_input)
         return functions[: len(s.guards(chart))]
 
     own = values(a, q)
     others = values(b, q)
-    terms = jnp.abs(jax.jacfwd(values, 1)(b, q)) @ jnp.abs(q)
+    slopes = jax.jacfwd(values, 1)(b, q)
+    terms = jnp.abs(slopes) @ jnp.abs(q)
     noise = ROUNDING * (terms + jnp.abs(others))
     apart = jnp.abs(others[:, None] - own)
     equal = apart <= noise[:, None]

@@ -65,6 +65,19 @@ class Rows(NamedTuple):
     trajectory; 0 where they may have either. (See `Bodies` for their use.)"""
 
 
+_TYPES = {
+    "body": np.int32,
+    "leg": np.int32,
+    "fraction": float,
+    "target": np.int32,
+    "place": np.int32,
+    "piece": np.int32,
+    "onward": bool,
+    "section": np.int32,
+    "signs": np.int32,
+}
+
+
 class Body(NamedTuple):
     """What rows of one kind do, for the compiler."""
 
@@ -110,12 +123,14 @@ class Form(NamedTuple):
     @property
     def charts(self) -> tuple[int, ...]:
         """The charts in which rows begin."""
-        return tuple(sorted({x.chart for x in self.bodies if x.way.does == STEP}))
+        begun = {x.chart for x in self.bodies if x.way.does == STEP}
+        return tuple(sorted(begun))
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
         """The kinds of jumps."""
-        return tuple(sorted({x.kind for x in self.bodies if x.does == JUMP}))
+        jumps = {x.kind for x in self.bodies if x.does == JUMP}
+        return tuple(sorted(jumps))
 
 
 class Itinerary(NamedTuple):
@@ -203,10 +218,12 @@ class _Leg(NamedTuple):
 
     def nodes(self, density: float) -> Float[np.ndarray, " 1+n"]:
         """Beginnings of steps, and the end, with so many steps for each recorded one."""
-        if self.at_once or self.times[-1] == self.times[0]:
+        lasts_no_time = self.times[-1] == self.times[0]
+        if self.at_once or lasts_no_time:
             return self.times[-1:]
         moves = len(self.times) - 1
-        count = max(1, int(np.ceil(moves * density - 1e-9)))
+        number = np.ceil(moves * density - 1e-9)
+        count = max(1, int(number))
         place = np.linspace(0, moves, count + 1)
         return np.interp(place, np.arange(moves + 1), self.times)
 
@@ -256,11 +273,15 @@ def recorded_walk(
     """
     legs = _legs(s, levels, walk, to)
     nodes = [leg.nodes(density) for leg in legs]
-    arrivals = np.flatnonzero(np.diff([leg.lane for leg in legs])) + 1
-    begins = {0, *arrivals.tolist()} if begins_on_section else {*arrivals.tolist()}
+    lanes = [leg.lane for leg in legs]
+    arrivals = np.flatnonzero(np.diff(lanes)) + 1
+    begins = set(arrivals.tolist())
+    if begins_on_section:
+        begins.add(0)
     begins.discard(len(legs))
     table = _Table(len(begins))
-    itinerary = _written(s, legs, nodes, table, {(k, -1) for k in begins})
+    pieces = {(k, -1) for k in begins}
+    itinerary = _written(s, legs, nodes, table, pieces)
     return itinerary, np.append(arrivals, len(legs)) - 1
 
 
@@ -281,14 +302,17 @@ def _written(
         goes_on = not is_last and (k + 1, -1) not in pieces
         before = leg.signs(times[-2]) if len(times) > 1 else leg.unknown
         _end(s, table, k, leg, before, goes_on, is_last)
-    ends = np.array([leg.times[-1] for leg in legs]) - legs[0].times[0]
+    last_times = np.array([leg.times[-1] for leg in legs])
+    ends = last_times - legs[0].times[0]
+    missing = -len(ends) % _LEGS
+    no_more = np.repeat(ends[-1:], missing)
     form, rows, used = _finished(table)
     armed = np.array(begun.armed).reshape(len(begun.charts), len(s.transitions))
     return Itinerary(
         form,
         rows,
         count=used,
-        ends=np.append(ends, np.repeat(ends[-1:], -len(ends) % _LEGS)),
+        ends=np.append(ends, no_more),
         last=len(ends) - 1,
         charts=np.array(begun.charts, np.int32),
         begins=np.array(begun.events, np.int32),
@@ -312,8 +336,10 @@ class _Pieces:
         """Begin a piece at a time in leg k, and return its number."""
         leg = self._legs[k]
         self.charts.append(leg.chart)
-        self.events.append(sum(before.code >= 0 for before in self._legs[:k]))
-        self.armed.append(_armed(self._s, leg.chart, t, leg.signs(t)))
+        earlier = self._legs[:k]
+        self.events.append(sum(before.code >= 0 for before in earlier))
+        signs = leg.signs(t)
+        self.armed.append(_armed(self._s, leg.chart, t, signs))
         return len(self.charts) - 1
 
 
@@ -332,7 +358,8 @@ def _rows_of_leg(
     leg, on a section.
     """
     if leg.code >= 0 and not leg.at_once and _is_scheduled(s, leg.code):
-        table.add(Body(SCHEDULE, leg.chart, (leg.code,)), k, leg.unknown)
+        schedule = Body(SCHEDULE, leg.chart, (leg.code,))
+        table.add(schedule, k, leg.unknown)
     step = Body(STEP, leg.chart)
     fractions = _fractions(times)
     if -1 in begins and not len(fractions):
@@ -354,14 +381,17 @@ def _is_certain(s: Structure, leg: _Leg) -> bool:
     if leg.code < 0:
         return True
     guards = s.guards(leg.chart)
+    before = leg.begins[-1]
+    after = leg.ends[-1]
     for place, g in enumerate(guards):
-        if g != leg.code and leg.begins[-1, place] > 0 and leg.ends[-1, place] == 0:
+        falls_to_zero = before[place] > 0 and after[place] == 0
+        if g != leg.code and falls_to_zero:
             return False
     if not leg.at_once:
         return bool(leg.times[-1] > leg.times[0])
     if _is_scheduled(s, leg.code):
         return False
-    return bool(leg.ends[-1, guards.index(leg.code)] < 0)
+    return bool(after[guards.index(leg.code)] < 0)
 
 
 def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:
@@ -370,24 +400,34 @@ def _armed(s: Structure, a: int, t: float, signs) -> Bool[np.ndarray, " G"]:
     for place, g in enumerate(s.guards(a)):
         armed[g] = signs[place] > 0
     time = np.array([t])
-    return with_schedules(s, armed, await_schedules(s, armed, time, time))[:, 0]
+    awaited = await_schedules(s, armed, time, time)
+    return with_schedules(s, armed, awaited)[:, 0]
 
 
 def _fractions(times: Float[np.ndarray, " 1+n"]) -> Float[np.ndarray, " n"]:
-    return np.diff(times) / (times[-1] - times[0]) if len(times) > 1 else np.zeros(0)
+    """Durations of the steps of a leg, as parts of its own."""
+    if len(times) < 2:
+        return np.zeros(0)
+    whole = times[-1] - times[0]
+    return np.diff(times) / whole
 
 
 def _pieces(nodes: list[Float[np.ndarray, " 1+n"]]) -> set[tuple[int, int]]:
     """The nodes at which pieces begin, by leg and number: nearly equal parts of the turn."""
-    places = [(k, j) for k, x in enumerate(nodes) for j in range(len(x) - 1)]
+    places = []
+    for k, of_leg in enumerate(nodes):
+        places += [(k, j) for j in range(len(of_leg) - 1)]
     times = np.array([nodes[k][j] for k, j in places])
-    whole = nodes[-1][-1] - nodes[0][0]
+    start = nodes[0][0]
+    whole = nodes[-1][-1] - start
     chosen = [0]
     for piece in range(1, PIECES):
-        first, last = chosen[-1] + 1, len(places) - (PIECES - piece)
-        goal = nodes[0][0] + piece * whole / PIECES
-        nearest = first + int(np.argmin(np.abs(times[first : last + 1] - goal)))
-        chosen.append(nearest)
+        # (Each piece after this one keeps a node of its own.)
+        first = chosen[-1] + 1
+        end = len(places) - (PIECES - piece) + 1
+        goal = start + piece * whole / PIECES
+        distance = np.abs(times[first:end] - goal)
+        chosen.append(first + int(np.argmin(distance)))
     return {places[k] for k in chosen}
 
 
@@ -411,7 +451,8 @@ def _end(
         if is_last:
             # (The next row tests what has happened in a step. Here none would follow.)
             table.add(Body(STEP, a), k, signs, section=leg.section)
-        table.add(Body(TIME), k, leg.unknown, target=len(s.guards(a)))
+        level = len(s.guards(a))
+        table.add(Body(TIME), k, leg.unknown, target=level)
     else:
         jump, place = _jump(s, leg.code, leg.at_once)
         target = -1
@@ -444,24 +485,34 @@ def _legs(
 ) -> list[_Leg]:
     """The legs of a recorded turn, or of a walk to sections."""
     moves = recorded_moves(*turn)
-    index = np.zeros(len(moves.h), np.int32) if to is None else to[moves.lane]
+    if to is None:
+        index = np.zeros(len(moves.h), np.int32)
+    else:
+        index = to[moves.lane]
     h = np.where(moves.at_once, 0.0, moves.h)
     before = _before_events(turn[1])
     begins = _signs(s, levels, moves.t, moves.chart, moves.q, index)
-    ends = _signs(s, levels, moves.t + h, moves.chart, before, index)
+    ends_of_moves = moves.t + h
+    ends = _signs(s, levels, ends_of_moves, moves.chart, before, index)
     is_last = moves.code >= 0
     is_last[-1] = True
     if to is not None:
         is_last[:-1] |= np.diff(moves.lane) != 0
-    last = np.flatnonzero(is_last)
-    legs, first = [], 0
-    for end in last:
+    legs = []
+    first = 0
+    for end in np.flatnonzero(is_last):
         own = slice(first, end + 1)
-        times = np.append(moves.t[own], moves.t[end] + h[end])
-        code, at_once = int(moves.code[end]), bool(moves.at_once[end])
-        a = int(moves.chart[first])
-        where = int(moves.lane[end]), int(index[end])
-        legs.append(_Leg(a, times, begins[own], ends[own], code, at_once, *where))
+        leg = _Leg(
+            int(moves.chart[first]),
+            np.append(moves.t[own], moves.t[end] + h[end]),
+            begins[own],
+            ends[own],
+            int(moves.code[end]),
+            bool(moves.at_once[end]),
+            int(moves.lane[end]),
+            int(index[end]),
+        )
+        legs.append(leg)
         first = end + 1
     return legs
 
@@ -477,19 +528,23 @@ def _signs(s: Structure, levels, t, chart, q, index) -> Int[np.ndarray, "M G"]:
 
     **Arguments:** `index` (M,): of the level that is watched.
     """
-    width = max(len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims)))
-    signs = np.zeros((len(t), width), int)
+    counts = [len(s.guards(a)) + levels_in(s, a, levels) for a in range(len(s.dims))]
+    signs = np.zeros((len(t), max(counts)), int)
     for a in np.unique(chart).tolist():
-        here = np.flatnonzero(chart == a)
-        point = t[here], q[: s.dims[a], here], np.zeros((s.nu, 1))
-        count = len(s.guards(a)) + levels_in(s, a, levels)
+        count = counts[a]
         if not count:
             continue
-        value = kernels.watched(s, a, levels, *point, index[here])[:, 0]
-        value = np.nan_to_num(value, posinf=np.inf, neginf=-np.inf)
-        finite = np.where(np.isfinite(value), np.abs(value), 0.0)
-        known = np.abs(value) > _NEAR_ZERO * finite.max(axis=1, keepdims=True)
-        signs[here, :count] = np.where(known, np.sign(value), 0).T
+        here = np.flatnonzero(chart == a)
+        state = q[: s.dims[a], here]
+        no_input = np.zeros((s.nu, 1))
+        rows = kernels.watched(s, a, levels, t[here], state, no_input, index[here])
+        value = np.nan_to_num(rows[:, 0], posinf=np.inf, neginf=-np.inf)
+        magnitude = np.abs(value)
+        finite = np.where(np.isfinite(value), magnitude, 0.0)
+        largest = finite.max(axis=1, keepdims=True)
+        known = np.abs(value) > _NEAR_ZERO * largest
+        sign = np.where(known, np.sign(value), 0)
+        signs[here, :count] = sign.T
     return signs
 
 
@@ -510,12 +565,13 @@ def _finished(table: _Table) -> tuple[Form, Rows, int]:
     width = len(table.rows[0][-1])
     for _ in range(-used % _ROUND):
         table.add(Body(NOTHING), 0, np.zeros(width, int))
-    columns = [np.array(x) for x in zip(*table.rows, strict=True)]
-    number = np.int32
-    types = number, number, float, *[number] * 3, bool, number, number
-    rows = Rows(*(x.astype(d) for x, d in zip(columns, types, strict=True)))
+    columns = {}
+    for name, values in zip(Rows._fields, zip(*table.rows, strict=True), strict=True):
+        columns[name] = np.array(values).astype(_TYPES[name])
+    rows = Rows(**columns)
     # (Bodies in one order, so that itineraries with the same ones share a program.)
     bodies = tuple(sorted(table.bodies))
-    place = np.array([bodies.index(body) for body in table.bodies], number)
+    place = np.array([bodies.index(body) for body in table.bodies], np.int32)
     rows = rows._replace(body=place[rows.body])
-    return Form(bodies, width, table.sections), rows, used
+    form = Form(bodies, width, table.sections)
+    return form, rows, used

@@ -111,22 +111,36 @@ def implicit_step(
     for the state and its columns together, with the same matrix: the second one gives them their
     first derivatives in directions from outside, by the implicit function theorem.
     """
-    A, c = np.array(method.a), np.array(method.c)
+    A = np.array(method.a)
+    b = np.array(method.b)
+    c = np.array(method.c)
 
     def lanes(t, q):
-        return jax.vmap(lambda q: field(s, a, t[0], q), -1, -1)(q)
+        def rate(q):
+            return field(s, a, t[0], q)
 
-    begin = jax.lax.stop_gradient((t[None], y[0][:, None], h[None]))
+        return jax.vmap(rate, -1, -1)(q)
+
+    def rates_at(t, y):
+        return rates(s, a, t, y.T, inputs).T
+
+    state = y[0][:, None]
+    point = (t[None], state, h[None])
+    begin = jax.lax.stop_gradient(point)
     near, _, J = increments(method, lanes, *begin, small=_NEAR)
     equations = StageEquations.at(method, lanes, *begin, near)
     # (From here on, the columns stand where lanes do.)
-    w = jnp.concatenate([near, jnp.zeros((*near.shape[:2], len(y) - 1))], axis=2)
+    directions = len(y) - 1
+    no_columns = jnp.zeros((*near.shape[:2], directions))
+    w = jnp.concatenate([near, no_columns], axis=2)
     for _ in range(2):
         stages = y.T + jnp.tensordot(A, w, 1)
-        along = jax.vmap(lambda t, y: rates(s, a, t, y.T, inputs).T)(t + c * h, stages)
+        along = jax.vmap(rates_at)(t + c * h, stages)
         change = equations.solve(h * along - w)
         w = w + change
-    left = jnp.max(jnp.abs(change[..., :1]), axis=0)
+    change_of_state = jnp.abs(change[..., :1])
+    left = jnp.max(change_of_state, axis=0)
     of_state = jax.lax.stop_gradient((w[..., :1], left))
     _, error = errors(method, *of_state, J, begin[2])
-    return y + jnp.tensordot(np.array(method.b), w, 1).T, error[:, 0]
+    end = y + jnp.tensordot(b, w, 1).T
+    return end, error[:, 0]

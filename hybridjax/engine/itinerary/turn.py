@@ -133,14 +133,16 @@ class _Steps:
         course, flags = self.travelers.each(of_lane)(*constants.begin, ends)
         # (Rows at which no piece begins write into one more place.)
         kept = lambda x: jnp.zeros((self.form.pieces + 1, *x.shape))  # noqa: E731
-        begun = _Begun(*map(kept, (course.t, course.y, course.delay, course.rate)))
+        state = (course.t, course.y, course.delay, course.rate)
+        begun = _Begun(*map(kept, state))
         return _State(course, begun), flags
 
     def take(self, constants: Constants, k, state: "_State", flags: Flags):
         """Step k, which may be the first of another pass."""
         if self.passes > 1:
             again = self._restart(constants, state, flags)
-            state, flags = _chosen(_is_new(constants, k), again, (state, flags))
+            is_new = _is_new(constants, k)
+            state, flags = _chosen(is_new, again, (state, flags))
         return self.row(constants, _row(constants, k), state, flags)
 
     def take_along(
@@ -164,7 +166,8 @@ class _Steps:
     def row(self, constants: Constants, row: Row, state: "_State", flags: Flags):
         """What a row does."""
         ended = state.begun.ended(row, state.course)
-        course, flags = self._bodies.take(Alone(constants), row, state.course, flags)
+        alone = Alone(constants)
+        course, flags = self._bodies.take(alone, row, state.course, flags)
         return _State(course, ended.begun(row, course)), flags
 
     def _restart(self, constants: Constants, state: "_State", flags: Flags):
@@ -235,10 +238,13 @@ def _passage(
     """What has been passed at the end."""
     (course, begun), K = state, form.pieces
     # (Columns begin anew with each piece: those before are the factors.)
-    factors = jnp.concatenate([begun.y[1:K], course.y[None]])[..., 1:, :]
+    ends = jnp.concatenate([begun.y[1:K], course.y[None]])
+    factors = ends[..., 1:, :]
     if form.sections and columns:
-        delays = jnp.concatenate([begun.delay[1:K], course.delay[None]])
-        factors = jnp.concatenate([delays[..., None], factors], axis=-1)
+        all_delays = [begun.delay[1:K], course.delay[None]]
+        delays = jnp.concatenate(all_delays)
+        first_column = delays[..., None]
+        factors = jnp.concatenate([first_column, factors], axis=-1)
     last = lambda x: jnp.moveaxis(x, 0, 1) if many else x  # noqa: E731
     return Passage(
         course.t,

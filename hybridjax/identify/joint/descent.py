@@ -84,7 +84,8 @@ class ModelPoint:
     def settled(self, step: Float[np.ndarray, " P"], gain: float) -> bool:
         """Test whether the undamped step and its expected decrease are too small to matter."""
         size = self.coordinates.size
-        unit = min(1.0, self.cost / max(self.problem.residuals - size, 1))
+        degrees = max(self.problem.residuals - size, 1)
+        unit = min(1.0, self.cost / degrees)
         if gain > _SETTLED_GAIN * size * unit:
             return False
         _, slopes = characteristic_slopes(self.coordinates)

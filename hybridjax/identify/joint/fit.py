@@ -189,7 +189,8 @@ class LDTPFit(WithCost, MultiplierFit):
         """Iterate over sections: roots of the covariance of the predictions by errors of the fit,
         in units of the noise."""
         part = SeriesPart.of(grid, self._scale)
-        S = cast(Predictor, self.predictor).S / np.outer(self._scale, self._scale)
+        units = np.outer(self._scale, self._scale)
+        S = cast(Predictor, self.predictor).S / units
         path = SeriesProblem(
             parts=[part],
             S=S,
@@ -370,7 +371,8 @@ def _fit_to_htf(htf: HTF, guess: Guess | None, check: bool) -> LDTPFit:
     point, converged = descend(ModelPoint(problem, model, direct))
     if htf.variance is None:
         # A second descent, with the outputs weighted by their residuals.
-        square = (np.abs(problem.errors(point.model)) ** 2).mean(axis=(0, 1, 3))
+        errors = np.abs(problem.errors(point.model))
+        square = (errors**2).mean(axis=(0, 1, 3))
         size = np.maximum(np.sqrt(square / 2), weights.SMALLEST_ERROR)
         problem = problem._replace(weight=problem.weight / size[:, None])
         start = ModelPoint(problem, point.model, direct)
@@ -541,7 +543,8 @@ def _series_problem(records: PreparedRecords, how: _How) -> SeriesProblem:
     parts = [SeriesPart.of(grid, records.scale) for grid in records.grids]
     drift = sum(round(float((part.drift**2).sum())) for part in parts)
     numbers = int(records.sampled.sum()) - drift
-    S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
+    unit = np.eye(len(records.outputs))
+    S = np.tile(unit, (records.n_sections, 1, 1))
     return SeriesProblem(
         parts=parts,
         S=S,
@@ -585,7 +588,8 @@ def _freedom_of(
 
 def _require_answer(point: ModelPoint) -> None:
     """**Raises:** `DefinitionError` if the inputs explain no more than unknowns do of noise."""
-    B, D = ([0.0 * x for x in matrices] for matrices in (point.model.B, point.model.D))
+    matrices_of_inputs = (point.model.B, point.model.D)
+    B, D = ([0.0 * x for x in matrices] for matrices in matrices_of_inputs)
     explained = point.problem.cost(point.model._replace(B=B, D=D)) - point.cost
     if explained < _ANSWERED * point.coordinates.size:
         raise DefinitionError(

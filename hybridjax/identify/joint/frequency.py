@@ -84,7 +84,8 @@ class FrequencyProblem(NamedTuple):
         for rows, slopes in pieces:
             J = slopes.reshape(P, -1).view(float)
             gram += J @ J.T
-            gradient += J @ np.ascontiguousarray(error[:, rows]).ravel().view(float)
+            residual = np.ascontiguousarray(error[:, rows]).ravel()
+            gradient += J @ residual.view(float)
         return NormalEquations(gram, gradient)
 
 
@@ -103,7 +104,8 @@ def transfer(
 def _outputs(
     model: PeriodicModel, n: int, state: Complex[np.ndarray, "d F nu"]
 ) -> Complex[np.ndarray, "ny F nu"]:
-    return _real_times(model.C[n], state) + model.D[n][:, None]
+    direct = model.D[n][:, None]
+    return _real_times(model.C[n], state) + direct
 
 
 def transfer_slopes(
@@ -116,7 +118,8 @@ def transfer_slopes(
     model = coordinates.model
     m = np.array(harmonics)
     if weight is None:
-        weight = np.ones((len(m), len(f), *model.D[0].shape))
+        entries = model.D[0].shape
+        weight = np.ones((len(m), len(f), *entries))
     # Derivatives by later states are those of the transposed system, in the other order.
     dual = model._replace(
         A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]]
@@ -138,7 +141,8 @@ def transfer_slopes(
                 for name, shape in shapes.items()
             }
             N = model.n_sections
-            waves = np.exp(-2j * np.pi / N * n * m) / N
+            angles = -2j * np.pi / N * n * m
+            waves = np.exp(angles) / N
             after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
             _fill(blocks, coordinates, n, states[n], after, waves, w)
         yield rows, slopes
@@ -167,7 +171,8 @@ def _fill(
     for j in range(weight.shape[3]):
         w = weight[..., j]
         x = state[None, :, None, :, None, j]
-        np.multiply((by_Y * w)[:, None], x, out=blocks["Y"][..., j])
+        weighted = (by_Y * w)[:, None]
+        np.multiply(weighted, x, out=blocks["Y"][..., j])
         blocks["B"][:, j, ..., j] = after * w
         if gains:
             blocks["K"][..., j] = (after * w)[:, None] * outputs[
@@ -189,7 +194,8 @@ def states_at(
     N = model.n_sections
     nu = model.B[0].shape[1]
     phi = model.monodromy()
-    back = np.exp(-2j * np.pi / N * f)[:, None]
+    angles = -2j * np.pi / N * f
+    back = np.exp(angles)[:, None]
 
     def around(x):
         states = []
@@ -198,8 +204,10 @@ def states_at(
             x = (_real_times(A, x) + B[:, None, :]) * back
         return states, x
 
-    _, forced = around(np.zeros((len(phi), len(f), nu), complex))
-    back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
+    none = np.zeros((len(phi), len(f), nu), complex)
+    _, forced = around(none)
+    turns = -2j * np.pi * f
+    back_a_period = np.exp(turns)[:, None, None]
     turn = phi * back_a_period
     resolvent = np.linalg.inv(np.eye(len(phi)) - turn)
     states, _ = around(np.einsum("fab,bfj->afj", resolvent, forced))
@@ -208,5 +216,7 @@ def states_at(
 
 def _real_times(matrix: Float[np.ndarray, "a b"], x: Complex[np.ndarray, "b *rest"]):
     """Return the product with a real matrix, (a, *rest)."""
-    parts = np.ascontiguousarray(x).view(float).reshape(len(x), -1)
-    return (matrix @ parts).view(complex).reshape(len(matrix), *x.shape[1:])
+    values = np.ascontiguousarray(x).view(float)
+    parts = values.reshape(len(x), -1)
+    product = (matrix @ parts).view(complex)
+    return product.reshape(len(matrix), *x.shape[1:])

@@ -69,7 +69,8 @@ def realized_htf(
         # Real and imaginary part have half of the variance each.
         spread = np.sqrt(np.asarray(htf.variance).sum(axis=0) / 2)
         scale = positive(np.sqrt((spread**2).mean(axis=(0, 2))))
-        weight = 1 / np.maximum(spread, SMALLEST_ERROR * np.abs(responses).max())
+        smallest = SMALLEST_ERROR * np.abs(responses).max()
+        weight = 1 / np.maximum(spread, smallest)
         edge = largest_of_noise((p + 1) * ny, 2 * F * nu)
     unit = scale[:, None]
     weight = weight * unit

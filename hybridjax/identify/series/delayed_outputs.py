@@ -35,7 +35,8 @@ def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:
     delays = range(order + 1)
 
     def past(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T ny d1"]:
-        return np.stack([delay_cycles(part.y[:, :, n], j) for j in delays], axis=3)
+        delayed = [delay_cycles(part.y[:, :, n], j) for j in delays]
+        return np.stack(delayed, axis=3)
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:
         columns = lagged_inputs(part.u, n, problem.lags, problem.records.lead)
@@ -70,7 +71,8 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
     order = delayed.gram.shape[1] - 1
     _, vectors = np.linalg.eigh(delayed.gram.sum(axis=0))
     null = vectors[:, 0]
-    if abs(null[0]) < NO_LEADING_COEFFICIENT * np.abs(null).max():
+    largest = np.abs(null).max()
+    if abs(null[0]) < NO_LEADING_COEFFICIENT * largest:
         return np.zeros(order)
     roots = np.roots(null / null[0])
     too_slow = np.maximum(np.abs(roots) / SLOWEST, 1.0)
@@ -81,5 +83,6 @@ def total_least_squares(delayed: DelayedOutputs) -> Coefficients:
 def ordinary_least_squares(delayed: DelayedOutputs) -> Complex[np.ndarray, " d"]:
     """Return the multipliers by plain regression, which noise in the outputs biases to zero."""
     gram = delayed.gram.sum(axis=0)
-    c, *_ = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0])
+    earlier = gram[1:, 1:]
+    c, *_ = np.linalg.lstsq(earlier, gram[1:, 0])
     return multipliers_of(-c)

@@ -143,7 +143,8 @@ class SeriesFit(MultiplierFit):
     def model(self) -> LDTP:
         """A minimal state-space model with the fitted responses, without states below the noise."""
         markov = self.impulse_response(2 * default_horizon(self.n_sections) + 1)
-        spread = (self.roots**2).sum(axis=4).mean(axis=(0, 2))
+        square = (self.roots**2).sum(axis=4)
+        spread = square.mean(axis=(0, 2))
         return realized(
             markov,
             noise=spread * self.noise[:, None] ** 2,
@@ -161,9 +162,11 @@ class SeriesFit(MultiplierFit):
         N, R, *shape = self.numerators.shape
         cycles = -(-max(self.lead + n_lags, R) // N)
         padding = cycles * N - R
-        h = np.pad(self.numerators, ((0, 0), (0, padding), (0, 0), (0, 0)))
+        widths = ((0, 0), (0, padding), (0, 0), (0, 0))
+        h = np.pad(self.numerators, widths)
         by_cycle = h.reshape(N, cycles, -1)
-        h = divide_by_chi(self.coefficients, by_cycle).reshape(N, -1, *shape)
+        divided = divide_by_chi(self.coefficients, by_cycle)
+        h = divided.reshape(N, -1, *shape)
         return h[:, self.lead : self.lead + n_lags]
 
     @checked
@@ -189,17 +192,24 @@ class SeriesFit(MultiplierFit):
             return divided_by_chi(by_harmonic, c, f, N, self.lead)
 
         H = sum_up(self.numerators)
-        period_delay = np.exp(-2j * np.pi * f)[:, None, None]
+        turns = np.exp(-2j * np.pi * f)
+        period_delay = turns[:, None, None]
         below = chi(period_delay, c)
-        lags = np.arange(1, len(c) + 1)[:, None, None, None, None]
-        slope = sum_up(self.slopes) - period_delay**lags / below * H
+        numbers = np.arange(1, len(c) + 1)
+        lags = numbers[:, None, None, None, None]
+        of_chi = period_delay**lags / below * H
+        slope = sum_up(self.slopes) - of_chi
         by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj())
         r = np.arange(self.numerators.shape[1]) - self.lead
-        powers = np.exp(-2j * np.pi / N * np.outer(f, r))
+        angles = np.outer(f, r)
+        rates = -2j * np.pi / N
+        powers = np.exp(rates * angles)
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
-        power = (np.abs(spread / N) ** 2).sum(axis=(1, 4))
+        square = np.abs(spread / N) ** 2
+        power = square.sum(axis=(1, 4))
         by_b = power / np.abs(below) ** 2
-        variance = by_c.real + by_b * self.noise[:, None] ** 2
+        of_noise = self.noise[:, None] ** 2
+        variance = by_c.real + by_b * of_noise
         variance = np.where(np.isnan(variance), np.inf, variance)
         names = self.inputs, self.outputs
         return HTF(f, H, harmonics, N, *names, "series fit", variance=variance)
@@ -226,7 +236,8 @@ class SeriesFit(MultiplierFit):
         N, ny, R, nu, r = self.roots.shape
         v = divide_by_chi(self.coefficients, grid.u)
         for n, root in enumerate(self.roots.reshape(N, ny, R * nu, r)):
-            yield np.tensordot(lagged_inputs(v, n, R, self.lead), root, (2, 1))
+            lagged = lagged_inputs(v, n, R, self.lead)
+            yield np.tensordot(lagged, root, (2, 1))
 
     def predicted(
         self, grid: CycleGrid, free_start: bool
@@ -240,16 +251,20 @@ class SeriesFit(MultiplierFit):
         no_drift = grid.drift[:, :, :0]
         out = np.zeros(grid.y.shape)
         for n, i in np.ndindex(N, ny):
-            numerator = self.numerators[n, :, i].reshape(-1, 1)
+            of_output = self.numerators[n, :, i]
+            numerator = of_output.reshape(-1, 1)
             forced = lagged_inputs(v, n, R, self.lead) @ numerator
-            starts = start_responses(self.coefficients, grid.first[:, n], T, free)
+            first = grid.first[:, n]
+            starts = start_responses(self.coefficients, first, T, free)
             unknown = np.concatenate([starts, grid.drift], axis=2)
             y = grid.y[:, :, n, i]
             sampled = grid.sampled[:, :, n, i]
             regression = SectionRegression.make(forced, unknown, no_drift, sampled)
-            error = regression.residual(np.ones(1), y).reshape(y.shape)
+            residual = regression.residual(np.ones(1), y)
+            error = residual.reshape(y.shape)
             response = regression.response(np.ones(1), y)
-            out[:, :, n, i] = np.where(sampled, y - error, response)
+            fitted = y - error
+            out[:, :, n, i] = np.where(sampled, fitted, response)
         return out
 
 
@@ -373,7 +388,8 @@ def _fit_open_loop(
     covariance, p_steady = _uncertainty(best.problem, best.solution)
     fit = assemble(best.problem, best.solution, covariance, best.converged)
     grid = records.whole()
-    error = np.where(grid.sampled, grid.y - fit.predicted(grid, free_start), 0.0)
+    left = grid.y - fit.predicted(grid, free_start)
+    error = np.where(grid.sampled, left, 0.0)
     answers = about_answers(grid, error, records.inputs, _BIASED)
     drift = _about_drift(fit, records, free_start)
 
@@ -419,7 +435,8 @@ def _about_drift(
         return unknown
     if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
-    may_be_one = np.real(fit.multipliers) + 2 * fit.standard_errors > 1
+    reach = 2 * fit.standard_errors
+    may_be_one = np.real(fit.multipliers) + reach > 1
     if not may_be_one.any() or may_be_one.all():
         return []
     fewer = coefficients_of(fit.multipliers[~may_be_one])
@@ -427,7 +444,8 @@ def _about_drift(
         problem = _problem_like(fit, slow(), len(fewer), free_start)
         solution, _ = minimize(problem, fewer, rough=True)
         _require_freedom(problem, solution)
-        spread = 1 / np.sqrt(2 * solution.dof.sum(axis=0))
+        degrees = solution.dof.sum(axis=0)
+        spread = 1 / np.sqrt(2 * degrees)
         if (_noise(solution) < 1 + 3 * spread).all():
             return [MAY_DRIFT]
     return []
@@ -440,7 +458,8 @@ def _of_order(
 
     **Raises:** `DefinitionError` for too few cycles.
     """
-    start = np.pad(fit.coefficients, (0, order - len(fit.coefficients)))
+    missing = order - len(fit.coefficients)
+    start = np.pad(fit.coefficients, (0, missing))
     return _rough(_problem_like(fit, records, order, free_start), start)
 
 
@@ -450,7 +469,8 @@ def _problem_like(
     """Return a problem in units of a fit's noise, with no more lags than the fit has, if possible:
     without zero multipliers they are enough."""
     N, R = fit.numerators.shape[:2]
-    extra_lags = max(R - 1 - fit.lead - order * N, 0)
+    beyond = R - 1 - fit.lead - order * N
+    extra_lags = max(beyond, 0)
     problem = OutputErrorProblem.from_data(records, order, extra_lags, free_start)
     return problem._replace(scale=fit.noise)
 
@@ -479,12 +499,14 @@ def assemble(
     for n, to_lags in enumerate(problem.to_lags):
         for fit in solution.fits[n]:
             by_c = np.moveaxis(fit.slopes[..., 0], 1, 0)
-            numerators[n][:, fit.outputs] = to_lags @ fit.coefficients[..., 0]
+            coefficients = fit.coefficients[..., 0]
+            numerators[n][:, fit.outputs] = to_lags @ coefficients
             slopes[:, n][..., fit.outputs] = to_lags @ by_c
             roots[n, fit.outputs, :, : fit.root.shape[1]] = to_lags @ fit.root
 
     def by_input(b):  # (..., R nu, ny) -> (..., R, ny, nu), in the units of the outputs
-        b = b.reshape(*b.shape[:-2], lags, nu, ny) * problem.scale
+        by_lag = b.reshape(*b.shape[:-2], lags, nu, ny)
+        b = by_lag * problem.scale
         return b.mT
 
     result = int(Result.OK if converged else Result.NOT_CONVERGED)
@@ -506,8 +528,10 @@ def assemble(
 
 def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
     """Return the standard deviation of each output's noise, in units of the problem's scale."""
-    left = solution.dof.sum(axis=0) - len(solution.c) / solution.dof.shape[1]
-    return np.maximum(np.sqrt(solution.square.sum(axis=0) / left), SMALLEST_ERROR)
+    of_c = len(solution.c) / solution.dof.shape[1]
+    left = solution.dof.sum(axis=0) - of_c
+    variance = solution.square.sum(axis=0) / left
+    return np.maximum(np.sqrt(variance), SMALLEST_ERROR)
 
 
 def missing_cycles(
@@ -533,8 +557,10 @@ def _noise_ratios(
 ) -> NoiseRatios:
     """Return the ratios of a fit to outputs with noise of this standard deviation."""
     rows = max(delayed.dof, 1)
-    gram = (delayed.gram / noise[:, None, None] ** 2).sum(axis=0)
-    return np.linalg.eigvalsh(gram) / rows, float(np.sqrt(2 / rows))
+    relative = delayed.gram / noise[:, None, None] ** 2
+    gram = relative.sum(axis=0)
+    spread = float(np.sqrt(2 / rows))
+    return np.linalg.eigvalsh(gram) / rows, spread
 
 
 # Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
@@ -611,7 +637,8 @@ class BlockScores(NamedTuple):
         d = self.scaled.shape[1]
         # Scores add up to zero at the minimum, which takes this part of the sum away.
         taken = np.einsum("bij,bji->", self.share, self.share) / d
-        square = self.scaled.T @ self.scaled / max(1 - taken, 0.5)
+        share = max(1 - taken, 0.5)
+        square = self.scaled.T @ self.scaled / share
         matrix = self.root @ square @ self.root.T
         return Covariance(matrix, denominator.block_freedom(self.scaled, self.share))
 
@@ -630,8 +657,10 @@ class BlockScores(NamedTuple):
         late = self.time - weight @ self.time / weight.sum()
         weighted = late[:, None] * self.scaled
         total = weighted.sum(axis=0)
-        square = float(total @ np.linalg.pinv(weighted.T @ weighted) @ total)
-        ratio = square / max(blocks - square, 1e-300) * (blocks - d) / d
+        inverse = np.linalg.pinv(weighted.T @ weighted)
+        square = float(total @ inverse @ total)
+        rest = max(blocks - square, 1e-300)
+        ratio = square / rest * (blocks - d) / d
         return float(special.fdtrc(d, blocks - d, ratio))
 
 
@@ -667,30 +696,36 @@ def block_scores(
     fits = linearize(problem, solution.c, outputs).fits
     grids = each_fit(problem, solution._replace(fits=fits), section)
     # Scores of the same block add, over all sections and outputs.
-    score = np.concatenate([sum(part.score for part in grid) for grid in grids])
-    by_white = np.concatenate([sum(part.expected for part in grid) for grid in grids])
+    by_grid = [sum(part.score for part in grid) for grid in grids]
+    score = np.concatenate(by_grid)
+    expected_by_grid = [sum(part.expected for part in grid) for grid in grids]
+    by_white = np.concatenate(expected_by_grid)
     parts = list(itertools.chain(*grids))
     squares = np.sum([part.squares for part in parts], axis=0)
     filtered = sum(part.filtered for part in parts)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)
-    white = np.array([[solution.dof.sum(), first], [first, second]])
+    total = solution.dof.sum()
+    white = np.array([[total, first], [first, second]])
     of_white, of_filtered = amounts(white, squares[:, 0])
-    by_filtered = np.einsum("bcd,bce->de", score[:, 1:], score[:, 1:]) / _FILTERED_DRAWS
+    drawn = score[:, 1:]
+    by_filtered = np.einsum("bcd,bce->de", drawn, drawn) / _FILTERED_DRAWS
     expected = of_white * by_white.sum(axis=0) + of_filtered * by_filtered
     true = of_white * solution.curvature.sum(axis=0) + of_filtered * filtered
     # In units in which noise like that of the data makes the sum one.
     try:
         half = np.linalg.inv(np.linalg.cholesky(expected))
         true = np.linalg.cholesky(true)
-        share = np.linalg.inv(np.linalg.cholesky(by_white.sum(axis=0)))
+        expected_by_white = by_white.sum(axis=0)
+        share = np.linalg.inv(np.linalg.cholesky(expected_by_white))
     except np.linalg.LinAlgError:
         return None
     time = []
     for grid, begins in zip(problem.parts(), problem.records.begins, strict=True):
         T = grid.y.shape[1]
         count = max(1, T // cycles)
-        middle = (np.arange(count) + 0.5) * -(-T // count)
+        length = -(-T // count)
+        middle = (np.arange(count) + 0.5) * length
         time.append((begins[:, None] + middle).ravel())
     return BlockScores(
         scaled=score[:, 0] @ half.T,
@@ -726,7 +761,8 @@ def _block_sums(
     response = filtered_response(measured, c, regression, x[..., :1])
     slopes = regression.residual(fit.slopes[..., :1], response)
     slopes = np.moveaxis(slopes[..., 0], 1, -1)
-    slopes = slopes.reshape(*error.shape[:3], len(c))
+    shape = error.shape[:3]
+    slopes = slopes.reshape(*shape, len(c))
     late = backward(slopes)
     squares = [(e**2).sum(axis=(0, 1, 2)) for e in (error, backward(error))]
     slopes = np.einsum("bkl,blid->bkid", weights, in_blocks(slopes, count))

@@ -61,10 +61,12 @@ def predicted(
     records = PreparedRecords(closed)
     grid = without_drift(records.whole())
     # (In units of what is left, or large drifts decide what the model explains.)
-    size = np.sqrt((grid.y**2).mean(axis=(0, 1, 2)))
+    square = (grid.y**2).mean(axis=(0, 1, 2))
+    size = np.sqrt(square)
     records.scale = np.maximum(size, RANK * records.scale)
     model = subspace_model(records, [order] * records.n_sections, False)
-    S = np.tile(np.eye(len(records.outputs)), (records.n_sections, 1, 1))
+    unit = np.eye(len(records.outputs))
+    S = np.tile(unit, (records.n_sections, 1, 1))
     return Predictor(model, S).predicted(grid, False) * records.scale
 
 
@@ -132,7 +134,8 @@ class LoopEquations:
         z = predicted(plant, drive, order)
         span = N if extra_lags is None else extra_lags
         self.lags = self.records.lead + order * N + span + 1
-        self.sections = [self._section(n, z, order + -(-span // N)) for n in range(N)]
+        free = order + -(-span // N)
+        self.sections = [self._section(n, z, free) for n in range(N)]
 
     def _section(
         self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int
@@ -142,22 +145,28 @@ class LoopEquations:
         _, T, _, nu = grid.u.shape
         ny = grid.y.shape[3]
         lead = self.records.lead
-        sampled = [delay_cycles(grid.sampled[:, :, n], j).all(axis=2) for j in delays]
-        begun = np.arange(T) >= grid.first[:, n, None] + free
+        of_section = grid.sampled[:, :, n]
+        sampled = [delay_cycles(of_section, j).all(axis=2) for j in delays]
+        first = grid.first[:, n, None] + free
+        begun = np.arange(T) >= first
         used = np.all(sampled, axis=0) & begun
-        signals = [lagged_inputs(u, n, self.lags, lead) for u in (z[..., :nu], grid.u)]
+        inputs_of_section = (z[..., :nu], grid.u)
+        signals = [lagged_inputs(u, n, self.lags, lead) for u in inputs_of_section]
         for y in (z[..., nu:], grid.y):
             signals += [delay_cycles(y[:, :, n], j) for j in delays]
         columns = np.concatenate(signals, axis=2)
         no_starts = grid.drift[:, :, :0]
         rows = SectionRegression.make(columns, no_starts, grid.drift, used).remainder
         lags = self.lags * nu
-        Z, U, late = np.split(rows, [lags, 2 * lags], axis=1)
+        ends = [lags, 2 * lags]
+        Z, U, late = np.split(rows, ends, axis=1)
         # Combinations of lags, of which the reference excites those that stand out of the noise.
         _, size, V = np.linalg.svd(Z, full_matrices=False)
         unexplained = np.linalg.norm((U - Z) @ V.T, axis=0)
         noise = unexplained / np.sqrt(max(used.sum(), 1))
-        kept = size > np.maximum(_EXCITED * noise, RANK * size.max(initial=0))
+        by_noise = _EXCITED * noise
+        by_rounding = RANK * size.max(initial=0)
+        kept = size > np.maximum(by_noise, by_rounding)
         to_lags = V[kept].T / size[kept]
         instruments = Z @ to_lags
         inputs = U @ to_lags
@@ -191,7 +200,8 @@ class LoopEquations:
         widest = max(x.root.shape[1] for x in self.sections)
         roots = np.zeros((N, ny, R, nu, widest))
         for n, x in enumerate(self.sections):
-            roots[n, ..., : x.root.shape[1]] = x.root.reshape(R, nu, -1)
+            columns = x.root.shape[1]
+            roots[n, ..., :columns] = x.root.reshape(R, nu, -1)
         return dict(
             multipliers=multipliers_of(c),
             coefficients=c,
@@ -228,20 +238,27 @@ class LoopEquations:
         outputs = np.array([x.outputs for x in sections])
         instruments = np.array([x.instruments for x in sections])
         for _ in range(2):  # the second time with the weights that the errors suggest
-            y = (outputs / scale[:, None]).reshape(-1, d + 1)
-            W = (instruments / scale[:, None]).reshape(-1, d)
+            scaled_outputs = outputs / scale[:, None]
+            y = scaled_outputs.reshape(-1, d + 1)
+            scaled_instruments = instruments / scale[:, None]
+            W = scaled_instruments.reshape(-1, d)
             along = W.T @ y
-            c, *_ = np.linalg.lstsq(along[:, 1:], along[:, 0])
+            earlier = along[:, 1:]
+            c, *_ = np.linalg.lstsq(earlier, along[:, 0])
             c = -c
-            square = ((outputs @ [1.0, *c]) ** 2).sum(axis=(0, 1))
-            scale = np.maximum(np.sqrt(square / dof), RANK * self.records.scale)
+            errors = outputs @ [1.0, *c]
+            square = (errors**2).sum(axis=(0, 1))
+            by_rounding = RANK * self.records.scale
+            scale = np.maximum(np.sqrt(square / dof), by_rounding)
         along = along[:, 1:]
         # The squared correlations of the earlier outputs with the instruments (Cragg, Donald 1993).
-        part = along.T @ np.linalg.lstsq(W.T @ W, along)[0]
+        by_instruments = np.linalg.lstsq(W.T @ W, along)[0]
+        part = along.T @ by_instruments
         others = y[:, 1:]
         part = np.linalg.pinv(others.T @ others, RANK) @ part
         part = np.clip(np.linalg.eigvals(part).real, 0, 1)
-        seen = part * dof * len(scale) > _DETERMINED * (1 - part)
+        evidence = part * dof * len(scale)
+        seen = evidence > _DETERMINED * (1 - part)
         return Solution(c, along, scale, int(seen.sum()))
 
     def solve(
@@ -282,7 +299,8 @@ class LoopEquations:
         The errors of a block are those of numerators that are fitted to the other blocks."""
 
         def blocks(x: np.ndarray) -> np.ndarray:
-            return in_blocks(x.reshape(*self.grid.y.shape[:2], *x.shape[1:]), count)
+            grid_shape = self.grid.y.shape[:2]
+            return in_blocks(x.reshape(*grid_shape, *x.shape[1:]), count)
 
         error = blocks(section.outputs @ [1.0, *c] / scale)
         instruments = blocks(section.instruments / scale[:, None])

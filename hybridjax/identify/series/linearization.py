@@ -100,7 +100,8 @@ def filtered_response(
     """Return q^-jN / chi of the fitted outputs, j = 1, ..., d."""
     filtered = divide_by_chi(c, regression.response(a, x))
     S, T = x.shape[:2]
-    delayed = np.zeros((S, T, len(c), *x.shape[2:]))
+    shape = (S, T, len(c), *x.shape[2:])
+    delayed = np.zeros(shape)
     for j in range(len(c)):
         delayed[:, :, j] = delay_cycles(filtered, j + 1)
     return delayed
@@ -128,9 +129,12 @@ class Linearization(NamedTuple):
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
         along = vectors.T @ self.gradient.sum(axis=0)
-        along = np.where(size > 0, along / positive(size), 0.0)
-        rest = np.sqrt(max(self.square.sum() - along @ along, 0.0))
-        jacobian = np.pad(size[:, None] * vectors.T, ((0, 1), (0, 0)))
+        divided = along / positive(size)
+        along = np.where(size > 0, divided, 0.0)
+        unexplained = self.square.sum() - along @ along
+        rest = np.sqrt(max(unexplained, 0.0))
+        scaled = size[:, None] * vectors.T
+        jacobian = np.pad(scaled, ((0, 1), (0, 0)))
         return np.append(along, rest), jacobian
 
 
@@ -180,7 +184,8 @@ def linearize(
             out.square[n, fit.outputs] = np.linalg.trace(fit.products)
             out.gradient[fit.outputs] += fit.gradient
             out.curvature[fit.outputs] += fit.curvature
-            out.dof[n, fit.outputs] = round(fit.dof) - fit.root.shape[1]
+            columns = fit.root.shape[1]
+            out.dof[n, fit.outputs] = round(fit.dof) - columns
     return out
 
 
@@ -191,7 +196,8 @@ def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
         columns = lagged_inputs(inputs[k], n, problem.lags, problem.records.lead)
         rows = columns @ problem.to_lags[n]
         T = part.y.shape[1]
-        starts = start_responses(c, part.first[:, n], T, min(problem.free, T))
+        free = min(problem.free, T)
+        starts = start_responses(c, part.first[:, n], T, free)
         regressions = []
         for alike in problem.alike[n]:
             sampled = part.sampled[:, :, n, alike[0]]
@@ -214,7 +220,8 @@ def each_fit(
     sections = range(problem.records.n_sections)
 
     def section(k: int, n: int) -> list[Any]:
-        pairs = zip(solution.fits[n], regress(k, parts[k], n), strict=True)
+        regressions = regress(k, parts[k], n)
+        pairs = zip(solution.fits[n], regressions, strict=True)
         return [work(k, parts[k], n, *pair) for pair in pairs]
 
     results = []

@@ -76,7 +76,8 @@ class SectionRegression(NamedTuple):
         basis = basis * kept[:, None]
         divisor = np.where(kept, size, 1)
         inverse = np.where(kept, 1 / divisor, 0)[:, None]
-        to_starts = (right.mT * inverse)[:, : starts.shape[2]]
+        scaled = right.mT * inverse
+        to_starts = scaled[:, : starts.shape[2]]
         remainder = without(basis, rows * inputs)
         remainder = remainder.reshape(rows.size, inputs.shape[2])
         return cls(inputs, starts, rows, basis, to_starts, remainder)
@@ -84,11 +85,13 @@ class SectionRegression(NamedTuple):
     @property
     def dof(self) -> float:
         """Samples less unknown initial conditions and drift."""
-        return float((self.weight > 0).sum() - (self.basis**2).sum())
+        used = (self.weight > 0).sum()
+        return float(used - (self.basis**2).sum())
 
     def reduced(self, x: Columns) -> Rows:
         """Return outputs, weighted, without the part in the basis."""
-        left = self.weight * x.reshape(*x.shape[:2], -1)
+        in_columns = x.reshape(*x.shape[:2], -1)
+        left = self.weight * in_columns
         for _ in range(2):  # the second time removes rounding errors
             left = without(self.basis, left)
         return left.reshape(len(self.remainder), *x.shape[2:])
@@ -105,7 +108,8 @@ class SectionRegression(NamedTuple):
         """Return the response to the inputs and to the initial conditions that fit x best."""
         S, T = x.shape[:2]
         columns = x.reshape(S, T, -1)
-        forced = self.inputs @ a.reshape(len(a), columns.shape[2])
+        coefficients = a.reshape(len(a), columns.shape[2])
+        forced = self.inputs @ coefficients
         left = self.weight * (columns - forced)
         starts = self.to_starts @ (self.basis.mT @ left)
         free = self.starts @ starts
@@ -152,8 +156,10 @@ class OutputErrorProblem(NamedTuple):
             for grid in records.grids:
                 cycle = np.arange(grid.y.shape[1])
                 later = cycle >= grid.first[:, n, None] + free
-                used = grid.sampled[:, :, n].any(axis=2) & later
-                rows.append(lagged_inputs(grid.u, n, lags, records.lead)[used])
+                is_sampled = grid.sampled[:, :, n].any(axis=2)
+                used = is_sampled & later
+                lagged = lagged_inputs(grid.u, n, lags, records.lead)
+                rows.append(lagged[used])
             return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
 
         # One section tells, before the work on all, that nothing is left of its samples.
@@ -185,7 +191,8 @@ class OutputErrorProblem(NamedTuple):
             len(g.y) * (self.free + g.drift.shape[-1]) for g in self.records.grids
         )
         samples = int(self.records.sampled[n, i])
-        return samples - self.lags * self.shape[1] - sum(starts)
+        unknowns = self.lags * self.shape[1]
+        return samples - unknowns - sum(starts)
 
     def parts(self) -> list[CycleGrid]:
         """Return all grids, with the outputs in units of `scale`."""
@@ -217,7 +224,8 @@ def _require_different_inputs(
     nu = len(records.inputs)
     alone = [_independent(triangle[:, i::nu], 1).shape[1] for i in range(nu)]
     # (Ranks of inputs in a narrow band are not exact.)
-    if rank < min(len(triangle), sum(alone) - min(alone) / 2):
+    most = sum(alone) - min(alone) / 2
+    if rank < min(len(triangle), most):
         raise DefinitionError(
             f"{listed(records.inputs)} cannot be told apart: leave out what others determine."
         )
@@ -226,10 +234,12 @@ def _require_different_inputs(
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
     # Inputs have units of their own.
     size = np.linalg.norm(triangle.reshape(-1, nu), axis=0)
-    size = np.tile(positive(size), triangle.shape[1] // nu)
+    lags = triangle.shape[1] // nu
+    size = np.tile(positive(size), lags)
     _, values, right = np.linalg.svd(triangle / size, full_matrices=False)
     kept = values > RANK * values.max(initial=0)
-    return right[kept].T / values[kept] / size[:, None]
+    scaled = right[kept].T / values[kept]
+    return scaled / size[:, None]
 
 
 def root_of(gram: Float[np.ndarray, "r r"]) -> Float[np.ndarray, "r k"]:

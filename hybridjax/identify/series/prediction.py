@@ -157,10 +157,12 @@ class SeriesProblem(NamedTuple):
                 white = np.matvec(whiten, path.error[n])
                 gram += flat.T @ flat
                 gradient += white.ravel() @ flat
-                along += path.starts[n].mT @ J.reshape(R, -1, P)
+                by_record = J.reshape(R, -1, P)
+                along += path.starts[n].mT @ by_record
             # Less what the initial states explain.
             taken = _solve_starts(path.start_gram, along)
-            gram -= np.tensordot(along, taken, ((0, 1), (0, 1)))
+            explained = np.tensordot(along, taken, ((0, 1), (0, 1)))
+            gram -= explained
         return NormalEquations(gram, gradient)
 
     def path(self, model: PeriodicModel, part: SeriesPart) -> Path:
@@ -178,9 +180,11 @@ class SeriesProblem(NamedTuple):
             given.append(mean)
             whiten.append(root)
             gain.append(G)
-            F.append(model.A[n] - G @ model.C[n])
+            corrected = G @ model.C[n]
+            F.append(model.A[n] - corrected)
             at_once = part.u[n] @ model.D[n].T
             y.append(part.y[n] - at_once)
+
         starts = 0
         if self.free_start:
             starts = max(model.dims[n] for n in part.first)
@@ -192,7 +196,8 @@ class SeriesProblem(NamedTuple):
                 x[begins, 0, :, 1 : 1 + d] = np.eye(d)
 
         def drive(n: int, later: Columns) -> None:
-            later[..., 0] += part.u[n] @ model.B[n].T
+            forced = part.u[n] @ model.B[n].T
+            later[..., 0] += forced
             sampled = y[n] * part.sampled[n]
             later[..., 0] += np.matvec(gain[n], sampled)
 
@@ -206,7 +211,8 @@ class SeriesProblem(NamedTuple):
         along = np.zeros((R, starts, 1))
         for n, x in enumerate(recursion(F, shape, enter, drive, filled)):
             error = model.C[n] @ x
-            error[..., 0] = y[n] - error[..., 0]
+            predicted = error[..., 0]
+            error[..., 0] = y[n] - predicted
             error = part.without_drift(n, error)
             white = whiten[n] @ error
             samples = white.shape[1] * white.shape[2]
@@ -227,8 +233,10 @@ class SeriesProblem(NamedTuple):
         errors = [e[..., 0] - from_starts(e) for e in errors]
         entering = []
         for n, x in enumerate(states):
-            innovation = y[n] - x @ model.C[n].T
-            entering.append(np.matvec(given[n], innovation * part.sampled[n]))
+            predicted = x @ model.C[n].T
+            innovation = y[n] - predicted
+            measured = innovation * part.sampled[n]
+            entering.append(np.matvec(given[n], measured))
         return Path(
             F=F,
             gain=gain,
@@ -300,8 +308,10 @@ def recursion(
         phi = step @ phi
     starts = np.zeros_like(x)
     for k in range(T - 1):
-        period = phi[:, min(k, phi.shape[1] - 1)]
-        starts[:, k + 1] = period @ starts[:, k] + x[:, k]
+        place = min(k, phi.shape[1] - 1)
+        period = phi[:, place]
+        carried = period @ starts[:, k]
+        starts[:, k + 1] = carried + x[:, k]
     x = starts
     for n, step in enumerate(F):
         enter(n, x)
@@ -330,10 +340,13 @@ def slopes_of(
         later[..., place["Y"]] += _outer(by_Y, x)
         later[..., place["B"]] += _outer(unit, u)
         if model.K[n].shape[1]:
-            predicted = x @ model.C[n].T + u @ model.D[n].T
-            later[..., place["K"]] += _outer(unit, predicted + path.entering[n])
+            by_input = u @ model.D[n].T
+            predicted = x @ model.C[n].T + by_input
+            error = predicted + path.entering[n]
+            later[..., place["K"]] += _outer(unit, error)
         if coordinates.direct:
-            later[..., place["D"]] += _outer(model.gain[n] - gain, u)
+            by_direct = model.gain[n] - gain
+            later[..., place["D"]] += _outer(by_direct, u)
 
     ends = [max(block.stop for block in place.values()) for place in places]
     shape = (*part.shape, coordinates.size)
@@ -343,7 +356,8 @@ def slopes_of(
         to_C = coordinates.to_C[n][None, None]
         slopes[..., place["Y"]] += _outer(to_C, path.x[n])
         if coordinates.direct:
-            unit = np.eye(len(model.C[n]))[None, None]
+            outputs = len(model.C[n])
+            unit = np.eye(outputs)[None, None]
             slopes[..., place["D"]] += _outer(unit, part.u[n])
         yield slopes
 
@@ -453,7 +467,8 @@ class Predictor(NamedTuple):
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the outputs expected at each sample, given the samples before it."""
-        part = SeriesPart.of(grid, np.ones(self.S.shape[1]))
+        ones = np.ones(self.S.shape[1])
+        part = SeriesPart.of(grid, ones)
         problem = SeriesProblem(
             parts=[part],
             S=self.S,
@@ -475,4 +490,5 @@ class Predictor(NamedTuple):
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
         """Return the errors of `predict`; NaN where an output was not sampled."""
-        return np.where(grid.sampled, grid.y - self.predicted(grid, free_start), np.nan)
+        left = grid.y - self.predicted(grid, free_start)
+        return np.where(grid.sampled, left, np.nan)

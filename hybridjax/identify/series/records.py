@@ -57,18 +57,22 @@ class CycleGrid(NamedTuple):
         S = len(records)
         T = max(map(count_cycles, records))
         N = records[0].n_sections
-        u = np.zeros((S, T * N, len(records[0].inputs)))
-        y = np.full((S, T * N, len(records[0].outputs)), np.nan)
+        inputs = len(records[0].inputs)
+        u = np.zeros((S, T * N, inputs))
+        shape = (S, T * N, len(records[0].outputs))
+        y = np.full(shape, np.nan)
         inside = np.zeros((S, T * N), bool)
         waves = [drift_waves(record) for record in records]
-        drift = np.zeros((S, T, max(wave.shape[1] for wave in waves)))
+        widest = max(wave.shape[1] for wave in waves)
+        drift = np.zeros((S, T, widest))
         for s, (record, wave) in enumerate(zip(records, waves, strict=True)):
             first = record.first_section
             rows = slice(first, first + len(record.u))
             u[s, rows] = record.u
             y[s, rows] = record.y
             inside[s, rows] = True
-            drift[s, : len(wave), : wave.shape[1]] = wave
+            columns = wave.shape[1]
+            drift[s, : len(wave), :columns] = wave
         sampled = np.isfinite(y)
         return cls(
             u=u.reshape(S, T, N, u.shape[2]),
@@ -104,7 +108,8 @@ def drift_waves(record: SectionSeries) -> Float[np.ndarray, "T K"]:
     T = count_cycles(record)
     if record.drift is None:
         return np.zeros((T, 0))
-    waves = np.arange(int(2 * T / record.drift) + 1)
+    number = int(2 * T / record.drift) + 1
+    waves = np.arange(number)
     middle = np.arange(T)[:, None] + 0.5
     return np.cos(np.pi / T * middle * waves)
 
@@ -144,7 +149,8 @@ class PreparedRecords:
         varies = np.fmax.reduce(y) > np.fmin.reduce(y)  # (without NaN)
         _require_signals(self.outputs, varies, "constant")
         require_deviations(self.records)
-        power = np.nansum(y**2, axis=0) / self.sampled.sum(axis=0)
+        square = np.nansum(y**2, axis=0)
+        power = square / self.sampled.sum(axis=0)
         self.scale = np.sqrt(power)
 
     @property
@@ -201,7 +207,8 @@ def _grids(
     grids = []
     begins = []
     while len(left):
-        alike = left[2 * cycles[left] >= cycles[left[0]]]
+        length = cycles[left[0]]
+        alike = left[2 * cycles[left] >= length]
         grids.append(CycleGrid.from_records([records[k] for k in alike]))
         begins.append(before[alike])
         left = left[len(alike) :]
@@ -216,8 +223,10 @@ def lagged_inputs(
     Inputs outside of the grid are zero. Columns are ordered by r, then by input.
     """
     S, T, N, nu = u.shape
-    margins = ((0, 0), (lags - 1 - lead, lead), (0, 0))
-    row = np.pad(u.reshape(S, T * N, nu), margins)
+    before = lags - 1 - lead
+    margins = ((0, 0), (before, lead), (0, 0))
+    in_order = u.reshape(S, T * N, nu)
+    row = np.pad(in_order, margins)
     windows = np.lib.stride_tricks.sliding_window_view(row, lags, axis=1)
     newest_first = windows[:, section::N, :, ::-1]
     return newest_first.mT.reshape(S, T, lags * nu)
@@ -228,12 +237,14 @@ def delay_cycles(x: Columns, cycles: int, fill: float | bool = 0) -> Columns:
     T = x.shape[1]
     cycles = min(cycles, T)
     before = np.full_like(x[:, :cycles], fill)
-    return np.concatenate([before, x[:, : T - cycles]], axis=1)
+    kept = x[:, : T - cycles]
+    return np.concatenate([before, kept], axis=1)
 
 
 def divide_by_chi(c: Coefficients, x: Columns) -> Columns:
     """Filter x by 1 / chi from cycle to cycle."""
-    return np.asarray(lfilter([1.0], np.append(1.0, c), x, axis=1))
+    chi = np.append(1.0, c)
+    return np.asarray(lfilter([1.0], chi, x, axis=1))
 
 
 def start_responses(
@@ -244,5 +255,6 @@ def start_responses(
     **Arguments:** `first`: the cycle in which each record first crosses the section.
     """
     begins = first[:, None] + np.arange(K)
-    impulse = np.arange(T)[:, None] == begins[:, None]
+    cycle = np.arange(T)[:, None]
+    impulse = cycle == begins[:, None]
     return divide_by_chi(c, impulse.astype(float))

@@ -67,9 +67,11 @@ def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
     for n, root in enumerate(spread):
         for i in range(error.shape[3]):
             sampled = np.isfinite(error[:, :, n, i])
-            left, size, _ = np.linalg.svd(root[:, :, i][sampled], full_matrices=False)
+            of_output = root[:, :, i][sampled]
+            left, size, _ = np.linalg.svd(of_output, full_matrices=False)
             along = left.T @ error[sampled, n, i]
-            excess = 1 - 1 / np.sqrt(1 + size**2)
+            widening = np.sqrt(1 + size**2)
+            excess = 1 - 1 / widening
             error[sampled, n, i] -= left @ (along * excess)
     return error
 
@@ -79,8 +81,10 @@ def whiteness_test(
 ) -> tuple[Float[np.ndarray, "N lags ny"], ByOutput]:
     """Return correlations of residuals with earlier ones, section by section, and p-values."""
     S, T, N, ny = error.shape
-    size = np.sqrt(np.nanmean(error**2, axis=(0, 1)))
-    scaled = (error / positive(size)).reshape(S, T * N, ny)
+    square = np.nanmean(error**2, axis=(0, 1))
+    size = np.sqrt(square)
+    relative = error / positive(size)
+    scaled = relative.reshape(S, T * N, ny)
     z = np.zeros((N, lags, ny))
     tested = np.zeros((N, lags, ny), bool)
     for k in range(lags):
@@ -96,15 +100,18 @@ def whiteness_test(
         z[:, k] = tested[:, k] * total / deviation
     # The mean over the sections of each lag, and the deviations from it: independent.
     sections = tested.sum(axis=0)
-    by_lag = z.sum(axis=0) ** 2 / np.maximum(sections, 1)
+    square_of_sum = z.sum(axis=0) ** 2
+    by_lag = square_of_sum / np.maximum(sections, 1)
     pooled = by_lag.sum(axis=0)
     deviations = (z**2).sum(axis=(0, 1)) - pooled
     degrees = (sections > 0).sum(axis=0)
     p = stats.chi2.sf(pooled, degrees)
     if N > 1:
+        # (One section has no deviations from the mean.)
         p_deviations = stats.chi2.sf(deviations, sections.sum(axis=0) - degrees)
         # The smaller of two, as a p-value.
-        p = -np.expm1(2 * np.log1p(-np.minimum(p, p_deviations)))
+        smaller = np.minimum(p, p_deviations)
+        p = -np.expm1(2 * np.log1p(-smaller))
     return z, p
 
 
@@ -132,7 +139,8 @@ def independence_test(
     tested = np.zeros(ny)
     degrees = np.zeros((2, ny))
     by_fits = np.zeros(ny)
-    roots = spread or [np.zeros((S, T, ny, 0))] * N
+    no_spread = [np.zeros((S, T, ny, 0))] * N
+    roots = spread or no_spread
     for n, root in enumerate(roots):
         past = lagged_inputs(u, n, lags, 0)
         for i in range(ny):
@@ -140,13 +148,15 @@ def independence_test(
             residual = error[:, :, n, i][present]
             if len(residual) < FEWEST_SAMPLES or not residual.any():
                 continue
-            test = _regressed(past[present], residual, root[:, :, i][present])
+            root_of_output = root[:, :, i][present]
+            test = _regressed(past[present], residual, root_of_output)
             z[n, :, i] = test.correlation.reshape(lags, u.shape[3])
             deviates[i] += test.deviate
             degrees[:, i] += test.degrees
             by_fits[i] += test.by_fit
             tested[i] += 1
-    p = stats.norm.sf(deviates / np.sqrt(np.maximum(tested, 1)))
+    number = np.maximum(tested, 1)
+    p = stats.norm.sf(deviates / np.sqrt(number))
     critical = special.fdtri(*degrees, 1 - level)
     shift = special.ncfdtrinc(*degrees, 1 - _POWER, critical)
     shift *= 1 + by_fits / np.maximum(degrees[0], 1)
@@ -181,14 +191,17 @@ def _regressed(
     correlation = inputs.T @ residual / np.sqrt(spread)
     left, values, _ = np.linalg.svd(inputs, full_matrices=False)
     kept = values > RANK * values[0]
-    left = left[:, kept][:, : samples // 2]
+    independent = left[:, kept]
+    left = independent[:, : samples // 2]
     explained = ((left.T @ residual) ** 2).sum()
     by_fit = ((left.T @ root) ** 2).sum()
     unexplained = (residual**2).sum() - explained
     degrees = left.shape[1], samples - left.shape[1]
     left_by_fit = (root**2).sum() - by_fit
-    ratio = explained / (degrees[0] + by_fit) * (degrees[1] + left_by_fit) / unexplained
-    p = np.clip(stats.f.sf(ratio, *degrees), 1e-300, 1 - 1e-16)
+    per_degree = explained / (degrees[0] + by_fit)
+    ratio = per_degree * (degrees[1] + left_by_fit) / unexplained
+    tail = stats.f.sf(ratio, *degrees)
+    p = np.clip(tail, 1e-300, 1 - 1e-16)
     return _Regressed(
         correlation=correlation,
         deviate=float(stats.norm.isf(p)),
@@ -199,8 +212,10 @@ def _regressed(
 
 def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
     """Return whether the residuals of each output are only rounding, and tell nothing."""
-    left = np.sqrt(np.nansum(error**2, axis=(0, 1, 2)))
-    size = np.sqrt((grid.y**2).sum(axis=(0, 1, 2)))
+    square = np.nansum(error**2, axis=(0, 1, 2))
+    left = np.sqrt(square)
+    square_of_outputs = (grid.y**2).sum(axis=(0, 1, 2))
+    size = np.sqrt(square_of_outputs)
     return left <= 1e3 * ROUNDING * size  # (iterations leave as much of exact data)
 
 
@@ -218,10 +233,12 @@ def about_misfit(
     it: a controller may have made them of the output.
     """
     S, T, N, ny = error.shape
-    late = np.where((grid.age > N)[..., None], error, np.nan)
+    is_late = (grid.age > N)[..., None]
+    late = np.where(is_late, error, np.nan)
     inputs = outside.u
     if not direct:
-        earlier = np.zeros((S, T * N, inputs.shape[3]))
+        shape = (S, T * N, inputs.shape[3])
+        earlier = np.zeros(shape)
         in_order = inputs.reshape(S, T * N, -1)
         earlier[:, 1:] = in_order[:, :-1]
         inputs = earlier.reshape(inputs.shape)
@@ -266,7 +283,8 @@ def _of_other_cycles(inputs: Signals, error: Signals) -> ByOutput:
     deviates = []
     for shift in np.unique(shifts.astype(int)):
         moved = np.roll(inputs, shift, axis=1)
-        _, p, _ = independence_test(moved, error, error.shape[2], ANSWER)
+        lags = error.shape[2]
+        _, p, _ = independence_test(moved, error, lags, ANSWER)
         deviates.append(_deviates_of(p))
     return np.mean(deviates, axis=0)
 
@@ -277,7 +295,8 @@ def about_answers(
     """Return a finding if inputs answer earlier residuals, as by a controller."""
     if is_exact(grid, error).all():
         return []
-    names = ", ".join(compress(inputs, feedback_test(grid, error) < ANSWER))
+    answers = feedback_test(grid, error) < ANSWER
+    names = ", ".join(compress(inputs, answers))
     if not names:
         return []
     text = f"inputs answer earlier residuals, as by a controller ({names}): {remedy}."
@@ -294,16 +313,21 @@ def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
     """
     S, T, N, nu = grid.u.shape
     lags = 2
-    earlier = np.zeros((S, T * N, error.shape[3]))
-    in_order = np.nan_to_num(error).reshape(S, T * N, -1)
+    shape = (S, T * N, error.shape[3])
+    earlier = np.zeros(shape)
+    known = np.nan_to_num(error)
+    in_order = known.reshape(S, T * N, -1)
     earlier[:, 1:] = in_order[:, :-1]
     new = np.full(grid.u.shape, np.nan)
     for n in range(N):
         is_late = grid.age[:, :, n] > lags + 1
         whole = grid.inside[:, :, n] & is_late
-        past = lagged_inputs(grid.u, n, lags + 1, 0)[whole][:, nu:]
+        lagged = lagged_inputs(grid.u, n, lags + 1, 0)
+        past = lagged[whole][:, nu:]
         u = grid.u[:, :, n][whole]
         by_past, *_ = np.linalg.lstsq(past, u)
-        new[:, :, n][whole] = u - past @ by_past
-    _, p, _ = independence_test(earlier.reshape(error.shape), new, lags, ANSWER)
+        explained = past @ by_past
+        new[:, :, n][whole] = u - explained
+    in_sections = earlier.reshape(error.shape)
+    _, p, _ = independence_test(in_sections, new, lags, ANSWER)
     return p

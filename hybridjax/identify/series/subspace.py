@@ -61,16 +61,21 @@ def subspace_model(
     # The effect of the past of each section on its outputs.
     rules = []
     for section in sections:
-        rows = np.concatenate([section.u * direct, section.past(past)], axis=1)
-        rules.append(_regress(rows, section.y)[section.u.shape[1] :])
-    horizon = max(-(-most // ny) + 1, min(past, N, default_horizon(0)))
+        known = [section.u * direct, section.past(past)]
+        rows = np.concatenate(known, axis=1)
+        rule = _regress(rows, section.y)
+        rules.append(rule[section.u.shape[1] :])
+    rows_of_outputs = -(-most // ny) + 1
+    longest = min(past, N, default_horizon(0))
+    horizon = max(rows_of_outputs, longest)
     to_state = []
     for n, section in enumerate(sections):
         # The effect of rows that are older by i samples.
         ahead = np.zeros((past * columns, horizon, ny))
         for i in range(min(horizon, past)):
             kept = (past - i) * columns
-            ahead[:kept, i] = rules[(n + i) % N][i * columns :]
+            older = rules[(n + i) % N]
+            ahead[:kept, i] = older[i * columns :]
         ahead = ahead.reshape(len(ahead), -1)
         root = np.linalg.qr(section.past(past), mode="r")
         _, size, directions = np.linalg.svd(root @ ahead, full_matrices=False)
@@ -79,7 +84,8 @@ def subspace_model(
             raise DefinitionError(
                 f"the data show {len(size)} dimensions of section {n}, not {d}: lower `dims`."
             )
-        size = np.maximum(size[:d], _SHRINKAGE * size[0])
+        smallest = _SHRINKAGE * size[0]
+        size = np.maximum(size[:d], smallest)
         scale = size / np.sqrt(len(section.y))
         to_state.append(ahead @ (directions[:d].T / scale))
     return _from_states(sections, to_state, past, innovations, direct)
@@ -107,23 +113,28 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     whole = 0.0
     age = records.whole().age.reshape(len(records.records), -1)
     for section in _sections(records, without_drift(drive.whole()).u):
-        length = max(min(len(section.y) // (_ROWS * columns), default_horizon(N)), 1)
+        by_samples = min(len(section.y) // (_ROWS * columns), default_horizon(N))
+        length = max(by_samples, 1)
         # (Zeros before a record are no past that determines inputs.)
         later = age[section.record, section.time] > length
         if later.sum() <= columns * length + nr:
             continue
         past = section.past(length)[later]
         y = section.y[later]
-        r, u = np.split(section.u[later], [nr], axis=1)
+        inputs = section.u[later]
+        r, u = np.split(inputs, [nr], axis=1)
         rows = np.concatenate([past, r], axis=1)
         floor = _SHRINKAGE * y.T @ y  # errors of the regressions, without noise
         gain = _log_size(past, y, floor) - _log_size(rows, y, floor)
-        degrees = len(y) - rows.shape[1] - (ny - nr + 1) / 2
+        correction = (ny - nr + 1) / 2
+        degrees = len(y) - rows.shape[1] - correction
         statistic += max(degrees, 0.0) * gain
-        left += float(((u - rows @ _regress(rows, u)) ** 2).sum())
+        unexplained = u - rows @ _regress(rows, u)
+        left += float((unexplained**2).sum())
         whole += float((u**2).sum())
     # (Rounding makes the statistic of a reference that its past predicts negative.)
-    p = special.gammaincc(N * ny * nr / 2, max(statistic, 0.0) / 2)
+    half = max(statistic, 0.0) / 2
+    p = special.gammaincc(N * ny * nr / 2, half)
     answer = bool(p <= ANSWER)
     if left <= _SHRINKAGE * whole:
         return answer or None
@@ -139,7 +150,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
 def _log_size(rows: np.ndarray, y: np.ndarray, floor: np.ndarray) -> float:
     """Return the log determinant of the errors of a regression."""
     error = y - rows @ _regress(rows, y)
-    return float(np.linalg.slogdet(error.T @ error + floor)[1])
+    gram = error.T @ error + floor
+    return float(np.linalg.slogdet(gram)[1])
 
 
 def without_drift(grid: CycleGrid) -> CycleGrid:
@@ -157,7 +169,8 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
                 no_columns, no_columns, grid.drift, weight[:, :, n]
             )
             z = x[:, :, n]
-            out[:, :, n] = regression.reduced(z).reshape(z.shape)
+            reduced = regression.reduced(z)
+            out[:, :, n] = reduced.reshape(z.shape)
         return out
 
     all_sampled = np.asarray(grid.sampled.all(axis=3))
@@ -174,7 +187,8 @@ def _sections(
     """Return the samples of more signals, the inputs and the outputs at each section."""
     grid = without_drift(records.whole())
     ny = len(records.outputs)
-    z = np.concatenate([*more, grid.u, grid.y / records.scale], axis=3)
+    scaled = grid.y / records.scale
+    z = np.concatenate([*more, grid.u, scaled], axis=3)
     sampled = np.asarray(grid.sampled.all(axis=3))
     return [_Section(z, sampled, n, ny) for n in range(records.n_sections)]
 
@@ -194,16 +208,19 @@ class _Section:
     def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
         """Return the `length` samples before, `later` samples later: newest first, zero before a
         record."""
-        back = self.time[:, None] + later - 1 - np.arange(length)
+        first = self.time[:, None] + later - 1
+        back = first - np.arange(length)
         is_inside = back >= 0
-        rows = self._z[self.record[:, None], np.maximum(back, 0)]
+        places = np.maximum(back, 0)
+        rows = self._z[self.record[:, None], places]
         rows = np.where(is_inside[..., None], rows, 0.0)
         return rows.reshape(len(back), -1)
 
 
 def _regress(rows: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return a least-squares solution, shrunk slightly: regressors without power get zero."""
-    size = positive(np.sqrt(np.square(rows).sum(axis=0)))
+    square = np.square(rows).sum(axis=0)
+    size = positive(np.sqrt(square))
     rows = rows / size
     gram = rows.T @ rows
     shrunk = gram + _SHRINKAGE * np.eye(len(size))
@@ -232,7 +249,8 @@ def _from_states(
             np.concatenate([rows, error], axis=1),
             section.past(past, 1) @ to_state[(n + 1) % N],
         )
-        A, B, K = np.split(later.T, [d, d + nu], axis=1)
+        ends = [d, d + nu]
+        A, B, K = np.split(later.T, ends, axis=1)
         blocks.append(
             (A, B, output[:d].T, output[d:].T, K if innovations else K[:, :0])
         )

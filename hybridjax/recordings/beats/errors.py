@@ -75,9 +75,11 @@ class Whitening(NamedTuple):
         bands = np.ones((2, len(y)))
         bands[1] = -self.kept
         taken = np.zeros_like(y)
-        taken[1:] = self.learned[:-1, None] * y[:-1]
+        learned = self.learned[:-1, None]
+        taken[1:] = learned * y[:-1]
         rate = linalg.solve_banded((1, 0), bands, taken, check_finite=False)
-        return (y - self.by_drift[:, None] * rate) / self.scale[:, None]
+        drifting = self.by_drift[:, None] * rate
+        return (y - drifting) / self.scale[:, None]
 
     def missed(self, residual: Lanes) -> Lanes:
         """Return by how much of a cycle forecasts miss that know all earlier intervals."""
@@ -103,7 +105,8 @@ def whitening(
     """
     L = len(rates)
     cycles = np.maximum(rates * ahead.duration, 1e-6)
-    weight = np.where(used, np.maximum(ahead.rate, 0.0) / np.sqrt(cycles), 0.0)
+    density = np.maximum(ahead.rate, 0.0) / np.sqrt(cycles)
+    weight = np.where(used, density, 0.0)
     by_drift = weight * ahead.slopes[:, -1]
     nothing = np.zeros(L)
     if not wander.size:
@@ -115,7 +118,8 @@ def whitening(
             scale=np.ones(L),
         )
     left = _left(intervals, wander.memory)
-    filters = _filters(by_drift, left[:, None], np.array([wander.size**2]))
+    square = np.array([wander.size**2])
+    filters = _filters(by_drift, left[:, None], square)
     kept, learned, scale = (x[:, 0] for x in filters)
     return Whitening(
         weight=weight, by_drift=by_drift, kept=kept, learned=learned, scale=scale
@@ -136,7 +140,8 @@ def _filters(
     now = stationary
     for k, (g, a) in enumerate(zip(by_drift.tolist(), left * left, strict=True)):
         variance[k] = now
-        now = a * (now / (1.0 + g * g * now)) + (1.0 - a) * stationary
+        carried = a * (now / (1.0 + g * g * now))
+        now = carried + (1.0 - a) * stationary
     square = 1.0 + drift**2 * variance
     return left / square, left * variance * drift / square, np.sqrt(square)
 
@@ -234,7 +239,8 @@ def _improbable(intervals: Intervals, white: Whitening, errors: Columns) -> floa
     **Arguments:** `errors`: derivatives by the rates, residuals, and derivatives by what was
     fitted.
     """
-    rest, _, power = without_rates(intervals, errors[:, 0], errors[:, 1:])
+    others = errors[:, 1:]
+    rest, _, power = without_rates(intervals, errors[:, 0], others)
     y = rest[:, 0]
     x = rest[:, 1:]
     curvatures, axes = np.linalg.eigh(x.T @ x)
@@ -244,5 +250,7 @@ def _improbable(intervals: Intervals, white: Whitening, errors: Columns) -> floa
     used = int(np.count_nonzero(white.weight))
     dof = used - len(power) - len(curvatures)
     left = float(y @ y - explained @ explained)
-    of_fit = float(np.log(curvatures).sum() + np.log(power).sum())
+    of_curvatures = np.log(curvatures).sum()
+    of_power = np.log(power).sum()
+    of_fit = float(of_curvatures + of_power)
     return dof * np.log(left / dof) + white.log_determinant + of_fit

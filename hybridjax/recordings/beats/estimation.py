@@ -306,15 +306,18 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     across = errors.across
     noise, excess = _noise(intervals, fit, errors)
     half_waves = np.arange(1.0, across.shape[1])
-    weight = ((_COARSE**2 + half_waves**2) / (_COARSE**2 + 1)) ** 2
+    relative = (_COARSE**2 + half_waves**2) / (_COARSE**2 + 1)
+    weight = relative**2
     curvature = across.T @ across
     score = across.T @ errors.residual + curvature @ fit.coefficients
     # The mean is free: its part is taken out.
-    share = curvature[1:, 0] / max(curvature[0, 0], _TINY)
+    of_mean = max(curvature[0, 0], _TINY)
+    share = curvature[1:, 0] / of_mean
     by_first = np.outer(share, curvature[0, 1:])
     inner = curvature[1:, 1:] - by_first
     pull = score[1:] - share * score[0]
-    gain, axes = np.linalg.eigh(inner / np.sqrt(np.outer(weight, weight)))
+    pairs = np.outer(weight, weight)
+    gain, axes = np.linalg.eigh(inner / np.sqrt(pairs))
     unit = max(noise, _TINY)
     gain = np.maximum(gain, 0.0) / unit
     power = (axes.T @ (pull / np.sqrt(weight)) / unit) ** 2
@@ -324,7 +327,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
         """Return minus twice the logarithm of the likelihood of tau^2."""
         size = np.exp(log_size)
         information = 1 + size * gain
-        return float((np.log1p(size * gain) - size * power / information).sum())
+        explained = size * power / information
+        return float((np.log1p(size * gain) - explained).sum())
 
     def unlikely(log_size: float) -> float:
         """Return minus twice the logarithm of the posterior density of the logarithm of tau."""
@@ -363,13 +367,16 @@ def _noise(
     across = errors.across
     residual = errors.residual
     curvature = across.T @ across
-    noise = residual - across @ np.linalg.lstsq(curvature, across.T @ residual)[0]
-    dof = int(fit.used.sum()) - len(fit.rates) - across.shape[1]
+    fitted = np.linalg.lstsq(curvature, across.T @ residual)[0]
+    noise = residual - across @ fitted
+    used = int(fit.used.sum())
+    dof = used - len(fit.rates) - across.shape[1]
     variance = float(noise @ noise) / max(dof, 1)
     if not variance > 0:
         return 0.0, 1.0
     block = _blocks(intervals)
-    sums = np.stack([np.bincount(block, x * noise) for x in across.T], axis=1)
+    by_block = [np.bincount(block, x * noise) for x in across.T]
+    sums = np.stack(by_block, axis=1)
     values, axes = np.linalg.eigh(curvature)
     determined = values > 1e-6 * values[-1]  # beyond rounding
     ratios = (sums @ axes[:, determined]) ** 2 / values[determined]
@@ -390,7 +397,8 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     errors = projected(intervals, fit, whitened(intervals, fit))
     across = errors.across
     # The same of durations: differences to forecasts, in s.
-    by_rates = errors.along[intervals.trial, 1:] * fit.by_rate[:, None]
+    of_rate = errors.along[intervals.trial, 1:]
+    by_rates = of_rate * fit.by_rate[:, None]
     in_seconds = fit.forecast.slopes[:, :-1] - by_rates
     data = across.T @ across
     smooth = np.diag(fit.penalty)
@@ -493,10 +501,13 @@ def carried_over(intervals: Intervals, fit: CurveFit) -> Carried:
     white = whitened(intervals, fit)
     response = fit.forecast.duration - 1 / fit.rates[intervals.trial]
     before = np.zeros(len(response))
-    before[1:] = np.where(follows(intervals, fit), response[:-1], 0.0)
+    is_followed = follows(intervals, fit)
+    before[1:] = np.where(is_followed, response[:-1], 0.0)
     errors = projected(intervals, fit, white)
-    by_rate = white(fit.forecast.slopes[:, -1:])[:, 0]
-    column = without_rates(intervals, by_rate, white(before[:, None])).rest[:, 0]
+    last = fit.forecast.slopes[:, -1:]
+    by_rate = white(last)[:, 0]
+    parts = without_rates(intervals, by_rate, white(before[:, None]))
+    column = parts.rest[:, 0]
     across = errors.across
     curvature = across.T @ across + np.diag(fit.penalty)
     taken = np.linalg.lstsq(curvature, across.T @ column)[0]

@@ -130,7 +130,8 @@ def _of_trial(
     duration = duration[used]
     step = float(np.median(duration)) / _STEPS
     steps = int(np.ceil(1.5 * duration.max() / step))
-    half_steps = np.arange(2 * steps + 1)[:, None] * step / 2
+    numbers = np.arange(2 * steps + 1)[:, None]
+    half_steps = numbers * step / 2
     # The phase advances evenly under the mean input.
     inputs = np.interp(start + half_steps, time, x - x.mean())
     trial = np.full(len(start), number)
@@ -153,7 +154,8 @@ def basis(phase: Lanes, waves: int, jitter: float = 0.0) -> Table:
 
 def tabulated(waves: int, jitter: float) -> Table:
     """Return the basis at equal steps of the phase from 0 on."""
-    return basis(np.arange(3 * _POINTS // 2 + 1) / _POINTS, waves, jitter)
+    points = np.arange(3 * _POINTS // 2 + 1)
+    return basis(points / _POINTS, waves, jitter)
 
 
 class Forecast(NamedTuple):
@@ -228,7 +230,8 @@ class _PhaseModel:
         """Interpolate tabulated values linearly."""
         place = self._place(phase)
         k = place.astype(np.int64)
-        return values[k] + (place - k) * (values[k + 1] - values[k])
+        rise = values[k + 1] - values[k]
+        return values[k] + (place - k) * rise
 
     def _force(self, phase: Lanes, u: Lanes) -> Float[np.ndarray, "l p1"]:
         nearest = np.ceil(self._place(phase) - 0.5).astype(np.int64)
@@ -241,7 +244,8 @@ class _PhaseModel:
         derivatives by the trapezoidal rule."""
         L = len(step)
         p = self.table.shape[1] + 1
-        result = Forecast(np.zeros(L), np.zeros(L), np.zeros((L, p)))
+        slopes = np.zeros((L, p))
+        result = Forecast(np.zeros(L), np.zeros(L), slopes)
         phase = np.zeros(L)
         u = inputs[0]
         now = _Running(
@@ -297,7 +301,8 @@ class _PhaseModel:
         k2 = advance(now.phase + k1 / 2, middle)
         k3 = advance(now.phase + k2 / 2, middle)
         k4 = advance(now.phase + k3, end)
-        phase = now.phase + (k1 + 2 * k2 + 2 * k3 + k4) / 6
+        slopes = k1 + 2 * k2 + 2 * k3 + k4
+        phase = now.phase + slopes / 6
         return phase, k1, k4
 
     def _derivatives(

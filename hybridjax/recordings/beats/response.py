@@ -155,7 +155,8 @@ class PhaseResponse(PhaseCurve):
         """
         waves = self._waves(phase)
         error = _errors(waves, self.covariance)
-        reach = float(stats.t.ppf((1 + level) / 2, self.dof)) * error
+        quantile = float(stats.t.ppf((1 + level) / 2, self.dof))
+        reach = quantile * error
         middle = waves @ self.coefficients
         return middle - reach, middle + reach
 
@@ -378,7 +379,8 @@ def _memory(intervals: Intervals, fit: CurveFit) -> float:
     after = follows(intervals, fit)
     if after.sum() < 3:
         return 0.0
-    errors = whitened(intervals, fit)(fit.residual[:, None])[:, 0]
+    white = whitened(intervals, fit)
+    errors = white(fit.residual[:, None])[:, 0]
     now = errors[1:][after]
     before = errors[:-1][after]
     return float(np.corrcoef(now, before)[0, 1])

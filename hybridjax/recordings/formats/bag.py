@@ -79,7 +79,8 @@ class _Topic:
         self.values.extend(numbers.values())
         self.arrivals.append(arrival)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
-        self.stamps.append(0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec)
+        nanoseconds = 0 if stamp is None else stamp.sec * 10**9 + stamp.nanosec
+        self.stamps.append(nanoseconds)
 
     def columns(self, start: int) -> Columns:
         """Return the columns in the order of their times, in s since the start of the bag (ns)."""

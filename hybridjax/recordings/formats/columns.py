@@ -212,7 +212,9 @@ def _set_with_groups(names: tuple[str, ...]) -> frozenset[str]:
 def split_header(header: str) -> tuple[str, str]:
     """Return name and unit of a header: `force (N)` -> `force`, `N`."""
     match = _BRACKETED.fullmatch(header.strip())
-    return (match[1].strip(), match[2].strip()) if match else (header.strip(), "")
+    if not match:
+        return header.strip(), ""
+    return match[1].strip(), match[2].strip()
 
 
 def is_unit(text: str) -> bool:

@@ -53,7 +53,8 @@ def _opensim(path: Path, lines: list[str], end: int, wanted: Wanted) -> Columns:
         for name in split_names(lines[start], separator)
     ]
     table = read_table(path, names, lines, start + 1, separator, wanted)
-    check_rows(path, len(next(iter(table.values.values()))), facts.get("nrows"), "rows")
+    first = next(iter(table.values.values()))
+    check_rows(path, len(first), facts.get("nrows"), "rows")
     if facts.get("indegrees") == "yes":
         table = table.with_finding(assumed("angles are in degrees."))
     return table

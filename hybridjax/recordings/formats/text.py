@@ -4,7 +4,7 @@ import codecs
 import csv
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..._core.findings import Finding
 from ..._core.signal import with_unit
 from ...errors import FileFormatError
 from .columns import EVENT, Columns, Wanted, assumed, is_unit, split_header, two_columns
@@ -222,8 +223,7 @@ def read_table(
     if values.shape[1] != len(headers):
         values, texts = _by_line(path, headers, lines, start, sep, wanted)
         if texts and wanted.signals is None:
-            names = ", ".join(f"'{headers[k]}'" for k in texts)
-            findings.append(assumed(f"columns of text were left out: {names}."))
+            findings.append(_about_texts(headers, texts))
         kept = [k for k in range(len(headers)) if k not in texts]
         headers = [headers[k] for k in kept]
         values = values[:, kept]
@@ -234,6 +234,12 @@ def read_table(
     columns = dict(zip(headers, values.T, strict=True))
     columns.pop("", None)
     return Columns(columns, tuple(findings))
+
+
+def _about_texts(headers: Sequence[str], columns: Iterable[int]) -> Finding:
+    """The finding that these columns were left out, as they are texts alone."""
+    names = ", ".join(f"'{headers[k]}'" for k in columns)
+    return assumed(f"columns of text were left out: {names}.")
 
 
 def _numbers_alone(lines: Sequence[str], sep: str) -> Float[np.ndarray, "n k"]:

@@ -115,7 +115,8 @@ def _odd(
         return
     usual = float(np.median(gain))
     turned = gain < -np.maximum(usual / 2, CLEAR * error)
-    foreign = (gain < usual / 2) & (gain + CLEAR * error < usual) & ~turned
+    surely_less = gain + CLEAR * error < usual
+    foreign = (gain < usual / 2) & surely_less & ~turned
     disturbed = left > np.maximum(_DISTURBED * np.median(left), explained / 4)
     disturbed &= ~turned & ~foreign
     causes = {
@@ -179,13 +180,15 @@ def _parts(data: SectionData, r: int, sections: int) -> Iterator[_Part]:
     number = min(_PARTS, cycles // _SHORTEST)
     if number < 1:
         return
-    u = (record.u[whole] / data.rms()[0]).reshape(cycles, N, -1)
+    scaled_inputs = record.u[whole] / data.rms()[0]
+    u = scaled_inputs.reshape(cycles, N, -1)
     y = (record.y[whole] / _robust_size(data)).reshape(cycles, N, -1)
     sections = min(N, sections)
     means = [x.mean(axis=1) for x in np.array_split(u, sections, axis=1)]
     u = np.stack(means, axis=1)
     at = np.linspace(0, N, sections, endpoint=False).astype(int)
-    y = np.clip(y[:, at].reshape(cycles, -1), -8, 8)  # outliers
+    in_cycles = y[:, at].reshape(cycles, -1)
+    y = np.clip(in_cycles, -8, 8)  # outliers
     time = data.times[r][whole].reshape(cycles, N)
     ahead = -(-record.lead // N)
     edges = np.linspace(0, cycles, number + 1).astype(int)
@@ -227,7 +230,8 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     N = data.n_sections
     size = data.rms()[1]
     tiny = np.finfo(float).tiny
-    waves = 2j * np.pi * np.fft.fftfreq(N, 1 / N)[:, None]
+    orders = np.fft.fftfreq(N, 1 / N)[:, None]
+    waves = 2j * np.pi * orders
     spectrum = np.fft.fft(data.cycle_outputs, axis=0)
     slope = np.fft.ifft(waves * spectrum, axis=0).real / size
     slope = slope[: N // 5].ravel()
@@ -272,7 +276,8 @@ def feedback(data: SectionData) -> Iterator[Finding]:
         data.inputs, data.cycle_inputs.T, deviations, strict=True
     ):
         repeated = float(np.nanvar(cycle))
-        share = repeated / max(repeated + float(deviation) ** 2, np.finfo(float).tiny)
+        total = repeated + float(deviation) ** 2
+        share = repeated / max(total, np.finfo(float).tiny)
         if share > 0.5:
             yield Finding(
                 "feedback",

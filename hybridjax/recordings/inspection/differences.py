@@ -69,7 +69,8 @@ def other_settings(
         usual_width = np.median(np.delete(width, s, axis=1), axis=1)
         swapped = _swapped(middle[:, s], width[:, s], usual, usual_width)
         for i, j in combinations(range(len(names)), 2):
-            if swapped[i, j] and {names[i], names[j]} <= set(outputs):
+            pair = {names[i], names[j]}
+            if swapped[i, j] and pair <= set(outputs):
                 yield Finding(
                     "swapped columns",
                     f"{names[i]} and {names[j]} have changed places in trial '{trial.name}': swap "
@@ -213,7 +214,8 @@ def odd_cycles(recording: Recording, phase: Phase) -> Iterator[Finding]:
             continue
         usual = float(np.median(period))
         off = np.abs(period - usual)
-        odd = off > max(_ODD * float(np.median(off)), _ALIKE_PERIODS * usual)
+        by_median = _ODD * float(np.median(off))
+        odd = off > max(by_median, _ALIKE_PERIODS * usual)
         if not odd.any():
             continue
         durations = (
@@ -337,8 +339,10 @@ def _difference(
     """Find the cause of a low correlation of the average cycles of a trial with those of others."""
 
     def correlations(x: Cycles) -> Float[np.ndarray, " k"]:
-        size = np.sqrt((x**2).sum(axis=1) * (usual**2).sum(axis=1))
-        return (x * usual).sum(axis=1) / np.maximum(size, np.finfo(float).tiny)
+        squares = (x**2).sum(axis=1) * (usual**2).sum(axis=1)
+        size = np.sqrt(squares)
+        products = (x * usual).sum(axis=1)
+        return products / np.maximum(size, np.finfo(float).tiny)
 
     alike = correlations(mean)
     unlike = np.flatnonzero(alike <= _CORRELATED).tolist()

@@ -182,7 +182,8 @@ def repeated_rows(
     values = [trial.values[:, columns] for trial in trials]
     deviation = np.ma.masked_invalid(np.concatenate(values)).std(axis=0)
     tolerance = _SAME * deviation.filled(0.0)
-    keys = [_keys(x / np.where(tolerance > 0, tolerance, 1.0)) for x in values]
+    unit = np.where(tolerance > 0, tolerance, 1.0)
+    keys = [_keys(x / unit) for x in values]
     repeated = [np.zeros(len(x), bool) for x in values]
     findings = []
     for i, j in combinations(range(len(trials)), 2):
@@ -206,10 +207,12 @@ def repeated_rows(
 def _keys(values: Samples) -> Float[np.ndarray, " m"]:
     """Return a number for each window of successive rows of rounded values (exactly: integers)."""
     shape = (_WINDOW, values.shape[1])
-    weights = np.random.default_rng(0).integers(1, 2**20, shape).astype(float)
+    rng = np.random.default_rng(0)
+    weights = rng.integers(1, 2**20, shape).astype(float)
     rows = np.round(values)
     last = max(len(values) - _WINDOW + 1, 0)
-    return np.sum([rows[k : k + last] @ weights[k] for k in range(_WINDOW)], axis=0)
+    products = [rows[k : k + last] @ weights[k] for k in range(_WINDOW)]
+    return np.sum(products, axis=0)
 
 
 def _shift(x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> int | None:

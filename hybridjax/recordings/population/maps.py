@@ -104,8 +104,10 @@ class MapResult(Showable):
                 values = x[place]
                 spans.append(f"{name} {values.min():.3g} to {values.max():.3g}")
         where = ", ".join(spans) or "none"
-        largest = f"{np.abs(self.values).max():.4g} {self.unit}".rstrip()
-        half_width = f"{np.median(self.reach):.3g} {self.unit}".rstrip()
+        largest_value = np.abs(self.values).max()
+        largest = f"{largest_value:.4g} {self.unit}".rstrip()
+        median = np.median(self.reach)
+        half_width = f"{median:.3g} {self.unit}".rstrip()
         return (
             f"MapResult({' x '.join(self.axes)}: largest {largest}\n"
             f"  median half-width of the 95 % band {half_width}\n"
@@ -288,10 +290,13 @@ def _of_groups(
     # The common mean, by the precision of both at each point.
     precisions = []
     for y, deviation in zip(flat, deviations, strict=True):
-        square = np.sum(np.abs(deviation) ** 2, axis=0) / (len(y) - 1)
+        squares = np.sum(np.abs(deviation) ** 2, axis=0)
+        square = squares / (len(y) - 1)
         precisions.append(len(y) / np.maximum(square, _least(y)))
     means = [y.mean(axis=0) for y in flat]
-    weighted = precisions[0] * means[0] + precisions[1] * means[1]
+    first = precisions[0] * means[0]
+    second = precisions[1] * means[1]
+    weighted = first + second
     common = weighted / (precisions[0] + precisions[1])
     null = [y - common for y in flat]
     rotations = [_rotations(len(y), draws, rng) for y in null]

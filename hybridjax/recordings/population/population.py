@@ -95,7 +95,8 @@ class Population(Showable):
                 raise DefinitionError(
                     f"`values` and `errors` of '{name}' must have {rows} rows."
                 )
-            wrong = np.flatnonzero(np.isfinite(self.values[name]) & ~(error > 0))
+            known = np.isfinite(self.values[name])
+            wrong = np.flatnonzero(known & ~(error > 0))
             if len(wrong):
                 row = wrong[0]
                 raise DefinitionError(
@@ -194,9 +195,11 @@ class Population(Showable):
             y = data["y"].to_numpy()
             v = data["v"].to_numpy()
             slopes = data.filter(like=_SLOPE)
-            x = np.column_stack([np.ones(len(y)), slopes - slopes.mean()])
+            ones = np.ones(len(y))
+            x = np.column_stack([ones, slopes - slopes.mean()])
             fit = meta(y, v, x)
-            spread = (np.sqrt(fit.between[0, 0]), *spread_interval(y, v, x))
+            between = np.sqrt(fit.between[0, 0])
+            spread = (between, *spread_interval(y, v, x))
             deviation = np.sqrt(v + fit.between[0, 0])
             residual = (y - x @ fit.coefficients) / deviation
             findings += _about_distribution(quantity, cell, residual)
@@ -390,7 +393,8 @@ class Population(Showable):
         count = by_subject["y"].count()
         excess = by_subject["y"].var().fillna(0.0) - by_subject["v"].mean()
         surplus = (count - 1).sum()
-        trial = max(((count - 1) * excess).sum() / max(surplus, 1), 0.0)
+        excess_square = ((count - 1) * excess).sum()
+        trial = max(excess_square / max(surplus, 1), 0.0)
         if trial > 0:
             between -= trial * np.mean(1 / count)
         if not between > 0:
@@ -399,7 +403,8 @@ class Population(Showable):
                 "from more subjects."
             )
         stride = np.mean(trials["v"] * trials["strides"])
-        k = max(round(np.sqrt(trial / between * subject_cost / trial_cost)), 1)
+        best = np.sqrt(trial / between * subject_cost / trial_cost)
+        k = max(round(best), 1)
         cost = (subject_cost + k * trial_cost) / stride_cost
         row = {
             "quantity": quantity,
@@ -535,7 +540,8 @@ def _polar(fit: MultiplierFit | NaturalMultipliers) -> tuple[float, float, list[
     covariance = fit.multiplier_covariances[0]
     # Derivatives of modulus and angle with respect to real and imaginary part.
     radial = np.array([z.real, z.imag]) / abs(z)
-    angular = np.array([-z.imag, z.real]) / abs(z) ** 2
+    turned = np.array([-z.imag, z.real])
+    angular = turned / abs(z) ** 2
     variances = [float(slope @ covariance @ slope) for slope in (radial, angular)]
     angle = abs(np.angle(z)) if z.imag else np.nan
     return abs(z), float(angle), variances
@@ -598,11 +604,13 @@ def _test(
     subjects = np.arange(n if paired else 2 * n)
     group = subjects // n
     x = np.eye(group[-1] + 1)[group]
-    contrast = np.array([1.0, -1.0])[: group[-1] + 1]
+    both = np.array([1.0, -1.0])
+    contrast = both[: group[-1] + 1]
 
     def draw(rng: np.random.Generator) -> int:
         v = rng.choice(variances, len(subjects))
-        y = np.sqrt(spread**2 + v) * rng.normal(size=len(subjects))
+        deviation = np.sqrt(spread**2 + v)
+        y = deviation * rng.normal(size=len(subjects))
         y += difference * (group == 0)
         fit = meta(y, v, x) if paired else mixed(y, v, x, subjects, group)
         value, error, dof = fit.contrast(contrast)

@@ -147,7 +147,8 @@ def meta(y: Reals, v: Reals, x: Design) -> Mixed:
     that scatter less than their errors would have none."""
     each = np.arange(len(y))
     fit = mixed(y, v, x, each, np.zeros(len(y), int))
-    square = weighted_squares(y, v + fit.between[0, 0], x) / fit.most
+    variance = v + fit.between[0, 0]
+    square = weighted_squares(y, variance, x) / fit.most
     covariance = fit.plain * max(square, 1.0)
     return fit._replace(covariance=covariance, slopes=np.zeros_like(fit.slopes))
 

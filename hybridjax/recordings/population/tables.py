@@ -67,7 +67,8 @@ def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
     """
     factors = factors_of(table)
     for factor in factors:
-        if len(set(labels)) == len(labels) and set(labels) <= set(table[factor]):
+        are_different = len(set(labels)) == len(labels)
+        if are_different and set(labels) <= set(table[factor]):
             return factor, table[factor].isin(labels)
     given = " and ".join(map(repr, labels))
     existing = [repr(x) for factor in factors for x in table[factor].unique()]
