@@ -104,9 +104,14 @@ def rounded(x: Any, error: Any) -> str:
         return number(x, _MOST_DIGITS)
     places = 1 - _exponent(error)
     if size > 0:
-        places = min(max(places, 1 - _exponent(size)), 8 - _exponent(size))
+        fewest = 1 - _exponent(size)
+        most = _MOST_DIGITS - 1 - _exponent(size)
+        places = min(max(places, fewest), most)
     real = _to_places(z.real, places)
-    return f"{real}{_to_places(z.imag, places, '+')}j" if z.imag else real
+    if z.imag == 0:
+        return real
+    imaginary = _to_places(z.imag, places, "+")
+    return f"{real}{imaginary}j"
 
 
 def standard_error(error: Any) -> str:
