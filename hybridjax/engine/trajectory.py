@@ -32,9 +32,10 @@ from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
 from .cubic import interpolate
+from .events import INSTANT
 from .lanes import IDLE, Lanes, Tape, lane_at
 from .move import Options, move
-from .settings import SIMULATION, Settings
+from .settings import ROUNDING, SIMULATION, Settings
 from .target import Target, until
 from .unresolved import passed_over
 from .watch import slopes
@@ -230,6 +231,35 @@ class Trajectory(Showable, eqx.Module):
         )
         findings = print_findings(self.findings, "  ").splitlines()
         return "\n".join([text, *findings])
+
+
+def states_at(
+    path: Trajectory, u: Float[np.ndarray, "nu 1"], times: Float[np.ndarray, " p"]
+) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p d"]]:
+    """Charts (p,) and states (p, d) at times (p,), under a constant input, as accurate as the
+    trajectory: by a step from the end of the last one before each time. States are NaN before its
+    begin and after its end.
+    """
+    s = path.structure
+    begin = path.t[0]
+    end = path.t[-1]
+    late = INSTANT * (end - begin) + ROUNDING * np.abs(end)
+    within = (times >= begin) & (times <= end + late)
+    row = np.searchsorted(path.t, times, side="right") - 1
+    # (No step is taken to times outside, where a state may leave all bounds.)
+    row = np.where(within, row, 0)
+    since = np.where(within, times - path.t[row], 0.0)
+    chart = path.chart[row]
+    states = np.zeros((len(times), s.d))
+    for a in np.unique(chart).tolist():
+        n = s.dims[a]
+        here = np.flatnonzero(chart == a)
+        t = path.t[row[here]]
+        q = path.after[row[here], :n].T
+        step = kernels.step(s, a, t, q, u, since[here])
+        states[here, :n] = step.q.T
+    states[~within] = np.nan
+    return chart, states
 
 
 def observed(

@@ -39,6 +39,7 @@ from ..engine.trajectory import (
     constant_input,
     guards_reached,
     integrate,
+    states_at,
 )
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system
@@ -148,11 +149,23 @@ class Flow(Showable, eqx.Module):
         """
         require_x64(self)
         require_as_made(self.system, "this flow was computed")
+        if self.trajectory is not None and not is_traced(times):
+            return self._on_steps(np.asarray(times))
         samples = _program(self.request, jnp.asarray(times)).samples
         depends = jnp.asarray(self.lane_results) == Result.SIMULTANEOUS
         chart = jnp.moveaxis(samples.chart, -1, 0)
         q = jnp.moveaxis(nan_where(depends, samples.q), -1, 0)
         return (chart, q) if self.request.many else (chart[0], q[0])
+
+    def _on_steps(
+        self, times: Float[np.ndarray, " K"]
+    ) -> tuple[Int[Array, " K"], Float[Array, "K d"]]:
+        """The same from the recorded steps of a single flow."""
+        path = self.require_trajectory()
+        chart, states = states_at(path, np.asarray(self.request.u), times)
+        if path.result == Result.SIMULTANEOUS:
+            states = np.full_like(states, np.nan)
+        return chart, states
 
     def __repr__(self):
         name = type(self.system).__name__

@@ -146,6 +146,7 @@ def test_a_drift_is_found_where_samples_are_missing(small):
     assert fit.dof == samples - 8 - fit.unknowns  # (8 constants)
 
 
+@pytest.mark.slow
 def test_too_few_dimensions_are_named(small):
     """Of plants with strong noise, and of exact ones (residuals are rounding); too many, too."""
     for noise, spare in ((0.3, "dimension less"), (0.0, "not determine")):

@@ -259,6 +259,7 @@ def test_an_order_that_is_too_low_is_noticed(small):
     assert not hj.fit_multipliers(htf, 2).findings
 
 
+@pytest.mark.slow
 def test_undeclared_drift_and_offsets_are_noticed(small, monkeypatch):
     """A drift with the right order or one less, and an offset with one multiplier too many."""
     slow = np.cos(np.pi / 100 * (np.arange(100) + 0.5) * np.arange(1, 5)[:, None]).sum(

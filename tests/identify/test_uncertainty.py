@@ -87,6 +87,7 @@ def test_regions_cover_and_errors_reach_the_bound(correlation, errors, small, va
         assert abs(excess) < 4 * dof
 
 
+@pytest.mark.slow
 def test_variances_from_few_experiments_are_good_enough_weights(small, variance):
     (model, htf) = small
     square = np.zeros(2)

@@ -39,6 +39,7 @@ def test_the_cycle_and_its_multipliers(n):
     assert names == [f"impact {i}" for i in masses]
 
 
+@pytest.mark.slow
 def test_events_that_coincide_neither_graze_nor_accumulate():
     cycle = hj.find_limit_cycle(hj.models.TrottingQuadruped())
     assert len(cycle.trajectory(2.0).events) == 8

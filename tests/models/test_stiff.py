@@ -71,6 +71,7 @@ def _top(cycle, near):
     return float(placed.lanes.q[0, 0])
 
 
+@pytest.mark.slow
 def test_the_hopper_on_a_compliant_ground():
     """With default settings; mpmath gives 20 digits."""
     cycle = hj.find_limit_cycle(m.CompliantHopper())

@@ -78,6 +78,7 @@ class EventTriggered(hj.HybridSystem):
         ]
 
 
+@pytest.mark.slow
 def test_a_cycle_that_was_found_as_four_turns_is_found_as_one():
     """From -1 to 1 it takes the time in which x + 1.5 grows from 0.5 to 2.5."""
     guess = hj.Guess("hold", (5e-7, -1.5e-6))

@@ -49,6 +49,7 @@ def test_another_period_or_none(system, state, message):
         hj.find_limit_cycle(system, hj.Guess("fall", state, 0.1))
 
 
+@pytest.mark.slow
 def test_a_period_that_does_not_follow_a_parameter():
     fixed = type("Fixed", (hj.models.Duffing,), {"period": lambda self: 4 * np.pi})
     with pytest.raises(

@@ -243,6 +243,7 @@ def test_an_event_in_place_of_a_schedule_is_found_by_all_searches():
     assert early.event_sequence == (0, 2)
 
 
+@pytest.mark.slow
 def test_clocks_that_tick_together_are_accepted_by_all_searches():
     guess = hj.Guess("a", (1.0,), time=0.9)
     found = results_of_all_searches(Clocks, guess, 0.9)

@@ -126,6 +126,7 @@ def test_a_branch_becomes_a_dataset_and_a_table(by_amplitude):
     st.floats(0.75, 0.95) | st.floats(1.05, 1.3),
     st.floats(0.02, 0.3),
 )
+@pytest.mark.slow
 def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
     """Any parameter, either way, in long steps and short ones; with T the clock changes, too."""
     given = float(getattr(juggling.system, parameter))

@@ -161,11 +161,12 @@ def test_events_whose_order_matters_have_a_derivative_for_each():
             r'it from 100 .*\. The system is stiff: a mode .*solver="auto"',
             100,
         ),
-        (
+        pytest.param(
             hj.models.VerticalHopper(k=1e7),
             (2.0, 1.9),
             r"256 \(reached.* of 1\).* `settle=60`",
             256,
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -202,6 +202,7 @@ def test_repeated_gradients_outside_of_programs_are_those_of_the_search(monkeypa
         assert_allclose(gradient(drive, 0.4), expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
     """Where the clock's phase of the anchor lies in stance for some, in flight for others."""
     monkeypatch.setattr(limit_cycles, "WORTH_COMPILING", 1)
@@ -352,6 +353,7 @@ class Thrower(hj.HybridSystem):
         return hj.Guess("falling", (0.9,))
 
 
+@pytest.mark.slow
 def test_a_guard_beyond_which_a_reset_leads_is_due_at_once_only_if_it_falls():
     """From one cycle to the other, in both directions, and with the pull upwards: there the weight
     that begins upwards reaches the ceiling at y = 1, and the other one never does."""
@@ -503,6 +505,7 @@ class Doses(hj.HybridSystem):
         return hj.Guess("blood", (0.5,), time=0.0)
 
 
+@pytest.mark.slow
 def test_a_step_to_where_other_events_happen_ends_no_search_in_a_program():
     """Before each dose 1 / (e - 1) is left. If that is too much for a dose, no cycle has the
     period of the clock, and Newton's method steps from no dose to one and back."""
@@ -571,6 +574,7 @@ def test_an_event_whose_predicate_holds_only_where_it_happens_is_seen():
         assert beside.result != hj.errors.Result.OK or beside.event_sequence
 
 
+@pytest.mark.slow
 def test_a_guard_that_a_reset_puts_on_its_zero_is_not_about_to_fall(monkeypatch):
     """The compass walker's guard is zero after heelstrike, but for rounding of either sign, and
     falls. On the cycles of its neighbors it has not passed its zero again."""

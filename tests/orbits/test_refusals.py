@@ -144,6 +144,7 @@ def test_a_guess_that_is_far_too_large_in_one_state_leads_to_the_same_accuracy(
     assert_allclose(far.multipliers, hopper_cycle.multipliers, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_failed_cycles_of_a_sweep_have_no_period():
     """Oscillators with the energy x^2 + v^2 = mu, which have no cycle for negative mu."""
 

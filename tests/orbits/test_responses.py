@@ -226,6 +226,7 @@ def test_an_amplitude_of_a_negative_multiplier_has_its_closed_form():
     assert_allclose(responses.amplitude(0, PHASES)["x"], exact, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_the_closed_form_of_a_response_has_its_derivative():
     section = hj.Crossing("y", "rising")
     guess = hj.Guess("plane", (0.33, 0.0))
@@ -312,6 +313,7 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     assert_allclose(by_speed, [1.0], rtol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.core
 def test_a_cycle_that_slides_on_four_walls_has_the_published_period_and_its_derivative():
     cycle = hj.find_limit_cycle(Square())
@@ -373,6 +375,7 @@ def test_phase_responses_are_differences_of_asymptotic_phases(name):
     assert_allclose(difference, exact, rtol=1e-6, atol=1e-6 * size)
 
 
+@pytest.mark.slow
 def test_pushes_off_a_surface_on_which_the_cycle_slides_are_lost():
     cycle = hj.find_limit_cycle(hj.models.BeltOscillator())
     flow = cycle.trajectory()
