@@ -328,8 +328,7 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
         block = int(counts.max())
     rng = np.random.default_rng(seed)
     # The first weights are those of all cycles, the others draws.
-    drawn = [_resampled(moments.records, block, rng) for _ in range(_DRAWS)]
-    weights = np.stack([np.ones(K), *drawn])
+    weights = np.vstack([np.ones(K), _resampled(moments.records, block, rng)])
     state, forward, square, cross, ahead = (
         np.tensordot(weights, products, (1, 1)) for products in moments[:5]
     )
@@ -529,17 +528,19 @@ def _resampled(
     records: Int[np.ndarray, " K"],
     block: int,
     rng: np.random.Generator,
-) -> Float[np.ndarray, " K"]:
-    """Draw blocks of each record, or whole records, and return how often each cycle was drawn."""
+) -> Float[np.ndarray, "B K"]:
+    """Draw blocks of each record, or whole records, and return how often each cycle is in each
+    draw."""
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
-        chosen = rng.choice(names, len(names))
-        return (records[:, None] == chosen).sum(axis=1).astype(float)
-    weights = np.zeros(len(records))
-    for record, count in zip(names, counts, strict=True):
-        length = min(block, count)
-        starts = rng.integers(0, count - length + 1, -(-count // length))
-        drawn = (starts[:, None] + np.arange(length)).ravel()[:count]
-        cycles = np.flatnonzero(records == record)
-        np.add.at(weights, cycles[drawn], 1.0)
+        chosen = [rng.choice(names, len(names)) for _ in range(_DRAWS)]
+        return (records[:, None] == np.array(chosen)[:, None, :]).sum(axis=2) * 1.0
+    weights = np.zeros((_DRAWS, len(records)))
+    cycles = [np.flatnonzero(records == name) for name in names]
+    for row in weights:
+        for own in cycles:
+            length = min(block, len(own))
+            starts = rng.integers(0, len(own) - length + 1, -(-len(own) // length))
+            drawn = (starts[:, None] + np.arange(length)).ravel()[: len(own)]
+            row[own] += np.bincount(drawn, minlength=len(own))
     return weights
