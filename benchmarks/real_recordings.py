@@ -284,7 +284,7 @@ def variability():
             print(f"{n_sections} sections: {found}", flush=True)
 
 
-def walking_layout(seeds=200, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
+def walking_layout(seeds=100, multipliers=(0.6, 0.3), n_sections=16, outputs=6):
     """Records as long as the segments, of a system whose multipliers are known."""
     print(
         f"\nThe layout of walking, simulated: multipliers {multipliers}, {seeds} draws"

@@ -338,8 +338,7 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
         block = int(counts.max())
     rng = np.random.default_rng(seed)
     # The first weights are those of all cycles, the others draws.
-    drawn = [_resampled(moments.records, block, rng) for _ in range(_DRAWS)]
-    weights = np.stack([np.ones(K), *drawn])
+    weights = np.vstack([np.ones(K), _resampled(moments.records, block, rng)])
     state, forward, square, cross, ahead = (
         np.tensordot(weights, products, (1, 1)) for products in moments[:5]
     )
@@ -570,20 +569,23 @@ def _resampled(
     records: Int[np.ndarray, " K"],
     block: int,
     rng: np.random.Generator,
-) -> Float[np.ndarray, " K"]:
-    """Draw blocks of each record, or whole records, and return how often each cycle was drawn."""
+) -> Float[np.ndarray, "B K"]:
+    """Draw blocks of each record, or whole records, and return how often each cycle is in each
+    draw."""
     names, counts = np.unique(records, return_counts=True)
     if block == counts.max():
-        chosen = rng.choice(names, len(names))
-        is_drawn = records[:, None] == chosen
-        return is_drawn.sum(axis=1).astype(float)
-    weights = np.zeros(len(records))
-    for record, count in zip(names, counts, strict=True):
-        length = min(block, count)
-        number = -(-count // length)
-        starts = rng.integers(0, count - length + 1, number)
-        rows = starts[:, None] + np.arange(length)
-        drawn = rows.ravel()[:count]
-        cycles = np.flatnonzero(records == record)
-        np.add.at(weights, cycles[drawn], 1.0)
+        chosen = [rng.choice(names, len(names)) for _ in range(_DRAWS)]
+        is_drawn = records[:, None] == np.array(chosen)[:, None, :]
+        return is_drawn.sum(axis=2).astype(float)
+    weights = np.zeros((_DRAWS, len(records)))
+    cycles = [np.flatnonzero(records == name) for name in names]
+    for row in weights:
+        for own in cycles:
+            count = len(own)
+            length = min(block, count)
+            number = -(-count // length)
+            starts = rng.integers(0, count - length + 1, number)
+            places = starts[:, None] + np.arange(length)
+            drawn = places.ravel()[:count]
+            row[own] += np.bincount(drawn, minlength=count)
     return weights
