@@ -144,11 +144,11 @@ def _fired(form: Form, s: Structure, row: Row) -> Int[Array, ""]:
         source = s.transitions[kind[0]].source
         guards = s.guards(s.chart_index(source))
         places.append([guards.index(g) if g in guards else 0 for g in kind])
-        most = max(map(len, places), default=1)
-        table = [x + [0] * (most - len(x)) for x in places]
-        # (The last row is for rows that are no jump.)
-        table.append([0] * most)
-        return jnp.asarray(table)[row.kind, row.place]
+    most = max(map(len, places), default=1)
+    table = [x + [0] * (most - len(x)) for x in places]
+    # (The last row is for rows that are no jump.)
+    table.append([0] * most)
+    return jnp.asarray(table)[row.kind, row.place]
 
 
 def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
