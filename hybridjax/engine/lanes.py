@@ -1,4 +1,16 @@
-"""Lanes: the hybrid states of many trajectories that move side by side; the tape of their moves."""
+"""Lanes: the hybrid states of many trajectories that move side by side; the tape of their moves.
+
+`Lanes` is the state of a flow, and `Tape` the record of its moves: the search writes it, `replay`
+follows it, and the package beyond `engine` reads it. Charts have functions of their own, which must
+not meet the states of another chart:
+
+- `only` gives a chart its own states: values of other lanes are replaced.
+- `needed` stops derivatives where a chart has no lane.
+- `nan_where` marks what failed, in values and derivatives.
+
+NaN in a derivative whose values are right comes from these three. (`_core/lanes.py` brings
+functions of single states to lanes.)
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -23,8 +35,9 @@ class Lanes(NamedTuple):
     chart: Index
     q: Padded
     armed: Bool[Array, "G L"]
-    """Which transitions (rows, by index) would fire at their guard's next falling zero, or at once
-    if it is beyond zero; which scheduled ones would fire if they are due at t."""
+    """Which transitions (rows, by index) are waiting. Such a transition fires at the next zero
+    through which its guard falls, or at once if the guard is beyond zero. A scheduled one fires if
+    it is due at t."""
     events: Index
     """Number of events so far."""
     pace: Float[Array, "4 L"]
@@ -102,7 +115,7 @@ def fixed(tree):
     return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
-# A number that is no zero leaves all bounds if it is multiplied twice by this one. Smaller: small
+# Any number but zero becomes infinite if it is multiplied twice by this one. Smaller: small
 # derivatives of lanes that failed are kept. (It must be finite: zero times infinity is NaN.)
 _LARGE = 1e300
 
@@ -129,7 +142,8 @@ def _nan_where_jvp(primals, tangents):
     _, t_x = tangents
     large = jnp.where(failed, _LARGE, 1.0)
     none = jnp.where(failed, 0.0, 1.0)
-    # (Infinity times zero is NaN, from the left, and in reverse mode from the right.)
+    # (Where a lane failed, the first two factors make a derivative infinite, and the zero makes it
+    # NaN. Reverse mode multiplies from the other end, and meets the last two first.)
     spoiled = t_x * large * large * none * large * large
     # (A number that does not change has NaN, too, where others of its lane do.)
     others = jnp.sum(spoiled, axis=-2, keepdims=True)
@@ -158,7 +172,7 @@ def needed(mask: Mask, tree):
 
 
 def side_by_side(tree):
-    """An axis of pieces of the flow of lanes, joined with that of lanes, if there is one."""
+    """Pieces of a flow as lanes: arrays (pieces, ..., L) become (..., pieces L)."""
 
     def join(x):
         *others, rows, columns = x.shape
@@ -222,7 +236,8 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
 
 
 def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:
-    """The tape of fewer `lanes`, each of which makes the moves of a group, one after the other."""
+    """The tape of fewer `lanes`, each of which makes the moves of a group, one after the other.
+    Groups are numbered from 0, in order."""
     lane, row = np.nonzero(tape.code.T != IDLE)
     group = group[lane]
     order = np.arange(len(group)) - np.searchsorted(group, group)
@@ -233,7 +248,8 @@ def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:
 
 
 def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Arrays of several tapes, the shorter ones with further rows without moves."""
+    """Arrays of several tapes, the shorter ones with further rows without moves. (Of such rows only
+    the code is read.)"""
     rows = max(map(len, parts))
     blank = IDLE if parts[0].dtype.kind == "i" else 0
     shape = (len(parts), rows, *parts[0].shape[1:])

@@ -10,6 +10,8 @@ which carry the derivatives that `saltation.py` writes out.
   moves in a chart are done in one pass.
 - `Variation` moves the start of a record, the numbers of the system and the times of the targets in
   some directions, on the host, and gives the tangents of states and of the Jacobians of `chain`.
+- `recorded_moves` reads the moves of a tape, and `linear_moves` linearizes each: what all who work
+  with recorded flow on the host begin with.
 
 A wrong derivative has its cause in a single move: compare `linear_moves` with differences of the
 three stages `_after_steps`, `_at_zeros` and `_after_resets`. If single moves are right, the order
@@ -227,8 +229,8 @@ def chain(
     only; and (t, q) at the end.
 
     `across` holds sizes of states by chart, for autonomous systems and targets at which the
-    direction of the flow has no meaning: it is projected out of every move, so that it does not
-    drown the other directions, however strongly the flow contracts.
+    direction of the flow has no meaning. This direction is projected out of every move, so that it
+    does not drown the others, however strongly the flow contracts.
     """
     n = 1 + s.d
     moves = recorded_moves(lanes, tape)
@@ -264,8 +266,11 @@ def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndar
 
 class Variation:
     """Recorded lanes that follow each other, each beginning where the last one ended, and their
-    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets. If not
-    `twice`, their Jacobians have no derivatives."""
+    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets.
+
+    **Arguments:** `twice`: whether `jacobians` will be asked for, which takes second derivatives of
+    every move.
+    """
 
     def __init__(
         self,

@@ -310,7 +310,9 @@ class ExperimentData(Showable, eqx.Module):
         unit = np.maximum(largest, np.finfo(float).tiny)
         total = np.abs((plus + minus) / unit).max(axis=(1, 2))
         size = np.abs(plus / unit).max(axis=(1, 2))
-        apart = ~(total <= _OPPOSITE * size)
+        # (Inputs of failed experiments may be unknown.)
+        both = self.ok[::2] & self.ok[1::2]
+        apart = both & ~(total <= _OPPOSITE * size)
         if apart.any():
             k = 2 * int(np.argmax(apart))
             raise DefinitionError(

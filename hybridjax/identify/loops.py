@@ -148,10 +148,14 @@ def _require_references(what: str, given: Names, needed: Names) -> None:
 
 
 def _without(sums: Sums, rows: np.ndarray) -> Sums:
-    """Return products of what is left of all signals without what those in these rows explain."""
+    """Return products of the residuals of all signals, after regression on those in these rows.
+
+    Each row takes one degree of freedom.
+    """
     total = sums.total
     power = total[:, rows[:, None], rows]
     inverse = np.linalg.pinv(power, hermitian=True)
-    explained = total[:, :, rows] @ inverse
-    left = explained @ total[:, rows]
-    return sums._replace(total=total - left, experiments=sums.experiments - len(rows))
+    coefficients = total[:, :, rows] @ inverse
+    explained = coefficients @ total[:, rows]
+    freedom = sums.experiments - len(rows)
+    return sums._replace(total=total - explained, experiments=freedom)

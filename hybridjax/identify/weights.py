@@ -1,5 +1,7 @@
 """The errors of harmonic transfer functions, known or supposed, as weights of fits.
 
+`check_values` comes first in every fit to HTFs, and `error_weights` gives the weights; fits in
+`identify` and `fitting` and the designs use both. A wrong weight comes from `_separated`.
 Experiments that measure the same lines are weighted by their power, in `spectral_sums.py`.
 """
 
@@ -53,11 +55,12 @@ def error_weights(
     """Return one over the standard deviation of real and imaginary part, known or supposed.
 
     Variances that were estimated with few degrees of freedom are poor weights: they are replaced
-    by the nearest product of a factor for each frequency and one for each harmonic, up to its
-    sign (which is the form for white noise and any spectrum of the input).
+    by the nearest product of a factor for each frequency and one for each modulus of a harmonic.
+    (Variances have this form for white noise and any spectrum of the input.) If any variance is
+    zero, they are taken as they are.
 
-    **Arguments:** `rms`: where there are no variances, errors are taken as equal parts of it, but
-    for the power of the inputs.
+    **Arguments:** `rms`: of each output. Without variances, the standard deviation is supposed to
+    be a constant part of it, times that of white noise at each line (`line_variances`).
     """
     if htf.variance is None:
         deviation = rms[:, None] * np.sqrt(line_variances(htf))
@@ -101,7 +104,7 @@ def weights_of(variance: Entries, rms: Float[np.ndarray, " ny"]) -> Entries:
     return np.sqrt(2 / np.maximum(variance, smallest))
 
 
-def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
+def estimated_noise(largest: float, misfit: float) -> tuple[float, float]:
     r"""Return the mean square of the noise in units of `htf.variance`, and its standard deviation.
 
     Both are 1 for variances that are known. With $\nu$ complex degrees of freedom
@@ -111,12 +114,12 @@ def estimated_noise(most: float, misfit: float) -> tuple[float, float]:
     many lines. Weights that are pooled have more degrees of freedom than each variance, so that L
     is taken from the misfit of a fit, as far as $\nu$ allows.
 
-    **Arguments:** `most`: `largest_misfit` of the HTFs. `misfit`: cost of the fit relative to its
-    expected value.
+    **Arguments:** `largest`: `largest_misfit` of the HTFs. `misfit`: cost of the fit relative to
+    its expected value.
 
     **Returns:** L, and the deviation in units of L.
     """
-    level = float(np.clip(misfit, 1.0, most))
+    level = float(np.clip(misfit, 1.0, largest))
     spread = np.inf
     if level < 2:
         spread = float(np.sqrt(level / (2 - level)))

@@ -1,6 +1,14 @@
 """The search for a limit cycle, by Newton's method on the return map with its exact Jacobian.
 
-If Newton's method fails, `newton.search` makes further attempts.
+`_near_cycle` starts from a known cycle, `_from_guess` from a state. Where Newton's method fails,
+further attempts follow in this order:
+
+1. `newton.search`: another period, and the smaller steps of Levenberg and Marquardt;
+2. `_solution`: another phase of the clock, a plane that the cycle meets once, more steps;
+3. `_judged`: the sizes of the states of the cycle that was found, and its shorter period;
+4. `_found_later`: all of this from where the flow leads after some periods.
+
+A cycle that is refused or accepted wrongly has its cause in `verdict.py` and `checks.py`.
 """
 
 import dataclasses
@@ -298,8 +306,12 @@ def _map_near_cycle(
 
 
 def _near_cycle(request: _Request, known: LimitCycle, traced: bool) -> LimitCycle:
-    """The cycle of a system that is similar to that of a known cycle: on the route of the known
-    one where it has one, otherwise by Newton's method."""
+    """The cycle of a system that is similar to that of a known cycle.
+
+    The recorded itinerary of the known one (its route, see `repeat.py`) leads to it, if it has one:
+    inside of programs (`traced_cycle`), for derivatives outside of them (`derived_cycle`), and for
+    calls that repeat (`repeated_cycle`). Otherwise Newton's method does.
+    """
     map = request.map
     if request.section is None and (is_inside_program() or traced):
         route = route_near(known)

@@ -4,6 +4,12 @@ Near a turn that was recorded, all moves of the next one are computed side by si
 decisions (`fixed_point`), then as the search would make them (`travel`). This takes a few calls of
 the kernels instead of one after the other for every step. (Multiple shooting: H. G. Bock and K. J.
 Plitt, IFAC Proceedings 17, 1984.)
+
+A wrong Newton step comes from `_changes`. A turn that is refused without need comes from
+`_forwards` (a move would end before it starts), from `_searched` (a move fails, or does not lead to
+the chart, the armed guards or the number of events with which the next one begins), or from
+`travel` (gaps). `newton.py`, `curve.py` and `batches.py` call this file, and so do sections that
+follow recorded moves.
 """
 
 import dataclasses
@@ -49,7 +55,7 @@ def newton_steps(
 def excess(
     q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]
 ) -> Float[np.ndarray, " S"]:
-    """The largest part of each step relative to the tolerance of `solve`, all in sizes."""
+    """The largest part of each step relative to the tolerance of Newton's method, in sizes."""
     tolerance = ATOL + RTOL * np.abs(q)
     return np.max(np.abs(step) / tolerance, axis=1)
 
@@ -69,7 +75,9 @@ def fixed_point(
     moves = recorded_moves(*turn)
     x = moves.q[:, 0] / sizes
     before = np.inf
-    while (moves.order == 0).sum() == PIECES:
+    # (A piece without a move cannot be shifted.)
+    every_piece_moves = (moves.order == 0).sum() == PIECES
+    while every_piece_moves:
         step, shift, h = _shift(map, moves, x, target)
         states = shift[:, 1:]
         in_sizes = states / map.scale[moves.chart]
@@ -114,8 +122,12 @@ def _shift(
 def _changes(
     by: Float[np.ndarray, "M n n"], gaps: Float[np.ndarray, "M n"], late: float
 ) -> Float[np.ndarray, "1+M n n"]:
-    """Changes of (t, q) where moves start, and at the last end, by the state at the first start,
-    and in the last column by the gaps between moves. The first one is `late`."""
+    r"""Changes of (t, q) where moves start, and at the end of the last one.
+
+    The columns are derivatives by the state at the first start; the last column is the change that
+    closes all gaps, of which the first is a time, `late`. With the derivatives $B_k$ of a move and
+    the gap $g_k$ behind it, $C_{k+1} = B_k C_k$, and $c_{k+1} = B_k c_k + g_k$ in the last column.
+    """
     n = by.shape[1]
     change = np.eye(n, k=-1)
     change[0, -1] = late
@@ -147,8 +159,11 @@ def _step_of(
 
 
 def _forwards(moves: Moves) -> Moves | None:
-    """The moves without those that end before they start, in whose places the moves before them
-    end; None where an event or another piece comes before."""
+    """The moves, all of which last forwards.
+
+    Where a move would end before it starts, the move before it goes to its end instead. None if
+    that one ends with an event, or belongs to another piece.
+    """
     back = np.flatnonzero(moves.h < 0)
     is_first = moves.order[back] == 0
     follows_event = moves.code[back - 1] != MOVE
@@ -191,7 +206,7 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
 
 
 def one_by_one(x: np.ndarray) -> np.ndarray:
-    """Lanes as pieces of the flow of one (as `engine.lanes.side_by_side` takes them)."""
+    """Arrays (..., pieces) as the pieces of one lane: (pieces, ..., 1)."""
     return np.moveaxis(x, -1, 0)[..., None]
 
 
@@ -304,7 +319,8 @@ def _setout(
     s = map.structure
     if not has_implicit(s):
         return setout
-    # (A deviation goes on until a piece ends or an event happens.)
+    # (The deviation of a move is that of the move before, carried along, where no piece or event
+    # ended between the two.)
     along = deviation(s, lanes, map.settings)
     _, by = linear_moves(s, moves, ends)
     by_state = by[:, 1:, 1 : 1 + s.d]

@@ -340,7 +340,7 @@ def find_cycle(
         drive.restore(At(0.0, drive.z, state=np.asarray(guess)))
         drive.step(drive.zero, drive.dt)
     # (One turn shows the sense of an angle; that of a guess is seen near it.)
-    drive.phase = _bound(drive, family, 1.0 if guess is None else 0.01)
+    drive.phase = _phase_of(drive, family, 1.0 if guess is None else 0.01)
     drive.phase.begin(drive.t, drive.z)
     settling = cycles if guess is None else 0
     for k in range(settling + 1):
@@ -418,8 +418,12 @@ def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> N
         )
 
 
-def _bound(drive: Drive, family: Any, turns: float) -> PlantPhase:
-    """Return the sections as a plant is taken to them. An angle first makes so many turns."""
+def _phase_of(drive: Drive, family: Any, turns: float) -> PlantPhase:
+    """Return the `PlantPhase` by which a plant is taken to the sections of a family.
+
+    **Arguments:** `turns`: the plant runs for so many turns of an angle, to learn in which sense it
+    turns.
+    """
     period = getattr(drive.plant, "period", None)
     items: Any = getattr(family, "items", ())
     if items and all(map(_is_of_a_signal, items)):

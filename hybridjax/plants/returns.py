@@ -3,11 +3,11 @@
 Simulators with fixed time steps let contacts begin and end at the ends of steps. The return is then
 a staircase as a function of the state: within a stair it has no noise, and a wrong slope.
 
-`measured_returns` takes the stages in order:
+Its caller (`cycle.py`) has called `ReturnMap.measure`, which finds the noise of returns, and the
+sizes of steps from it. `measured_returns` then takes the stages in order:
 
 1. `ReturnMap.solve` moves the state to the fixed point of the return.
-2. `ReturnMap.all_slopes` measures central differences with several steps, after `measure` has
-   found their sizes from the noise of returns.
+2. `ReturnMap.all_slopes` measures central differences with several steps.
 3. `_fitted` fits a Jacobian and its errors to these slopes.
 4. `_eigenvalues` and `_resolved` find the multipliers that differ from 0, with their covariance.
 
@@ -43,19 +43,20 @@ _STEPS = np.array([1.0, 1.2, 2.0, 2.4, 3.3, 4.0])
 # The first four are narrow, the last four wide.
 _NARROW = _STEPS <= _STEPS[3]
 _WIDE = _STEPS >= _STEPS[2]
-# Even powers of the step, with the constant, by which slopes are fitted. Their scatter about this
-# fit is the noise: with fewer, curvature counts as noise; with more, few degrees of freedom remain.
-_POWERS = 3
+# Even powers of the step, with the constant, about which the scatter of slopes is the noise: with
+# fewer, curvature counts as noise; with more, few degrees of freedom remain.
+_POWERS_OF_SCATTER = 3
 # All steps are repeated until coordinates times repetitions reach this number. Smaller: the noise
 # of one coordinate is known from six pairs only. Larger: more time for few coordinates.
 _COLUMNS = 4
-# Smallest step in units of the range of a coordinate, at most. Larger: the widest steps, four times
-# as long, leave the linear range. Smaller: contacts of simulators with fixed time steps begin at
-# the same step for all of them, so that their noise hides.
-_LARGEST_STEP = 0.01
+# The smallest of the steps is at most this part of the range of a coordinate. Larger: the widest
+# steps, four times as long, leave the linear range. Smaller: contacts of simulators with fixed time
+# steps begin at the same step for all of them, so that their noise hides.
+_MOST_OF_SMALLEST_STEP = 0.01
 # Phases of the grid at which its noise is measured. Fewer: stairs between them hide. More: time.
 _GRIDS = 8
-# Phases of the grid with which the plant is tried. One of them: steps that divide it hide.
+# Phases of the grid with which the plant is tried. With a single one, a plant whose steps divide
+# this phase would not show its grid.
 _TRIED = (0.381966, 0.618034)
 # Part of the range by which a return may differ if the grid is moved. Larger: controllers that
 # count time steps are disturbed. Smaller: errors of integration count as a disturbance.
@@ -202,7 +203,7 @@ class ReturnMap:
         # Steps at which noise and the error of fourth order are nearly equal for a function of unit
         # derivatives.
         step = (self.noise / self.size).max() ** 0.2 / 2
-        self.h = self.size * min(step, _LARGEST_STEP)
+        self.h = self.size * min(step, _MOST_OF_SMALLEST_STEP)
 
     def measure_ranges(self) -> None:
         """Measure the ranges of the coordinates, in one cycle."""
@@ -236,7 +237,7 @@ class ReturnMap:
         """
         rng = np.random.default_rng(1)
         signs = rng.choice([-1, 1], len(self.x))
-        move = 2 * _LARGEST_STEP * self.size * signs
+        move = 2 * _MOST_OF_SMALLEST_STEP * self.size * signs
         states = []
         signals = []
         for first in _grid_phases(rng, _GRIDS):
@@ -414,7 +415,7 @@ def measured_returns(map: ReturnMap) -> Returns:
     residual = map.solve()
     map.require_on_cycle(residual)
     resolved = _resolved(_slopes_of(map))
-    longest = _LARGEST_STEP * map.size
+    longest = _MOST_OF_SMALLEST_STEP * map.size
     if _hides(resolved) and (map.h < longest).any():
         map.h = longest
         resolved = _resolved(_slopes_of(map))
@@ -464,9 +465,9 @@ class _Jacobian(NamedTuple):
 
     value: Float[np.ndarray, "d d"]
     errors: Float[np.ndarray, "pairs d d"]
-    """Their sum, each times a random number of variance 1 for each column, has the covariance of
-    the noise of `value`. (Outputs have errors in common: those of a contact that begins one time
-    step later.)"""
+    """Errors of `value`, by pair. If each is multiplied by a random number of variance 1 for each
+    column, their sum has the covariance of the noise. (Outputs have errors in common: those of a
+    contact that begins one time step later.)"""
     tolerance: Float[np.ndarray, "d d"]
     """Standard deviations of errors that pairs may have in common, as those of tolerances."""
     apart: Float[np.ndarray, "d d"]
@@ -495,11 +496,12 @@ def _fitted(
     repeats = len(slopes) // len(_STEPS)
     steps = np.tile(_STEPS, repeats)
     weights = steps**2
-    coefficients = np.tensordot(_solution(steps, _POWERS), slopes, (1, 0))
-    fitted = np.tensordot(_powers(steps, _POWERS), coefficients, (1, 0))
+    coefficients = np.tensordot(_solution(steps, _POWERS_OF_SCATTER), slopes, (1, 0))
+    fitted = np.tensordot(_powers(steps, _POWERS_OF_SCATTER), coefficients, (1, 0))
     residuals = slopes - fitted
     # (Of unit weight.)
     residuals = residuals * np.sqrt(weights)[:, None, None]
+    # (The Jacobian is the constant of a fit with one more power.)
     constant = _solution(steps, 2)[0]
     variance = (constant**2 / weights).sum()
     between = np.zeros_like(steps)
@@ -508,7 +510,7 @@ def _fitted(
     between[narrow] += _solution(steps[narrow], 2)[0]
     between[wide] -= _solution(steps[wide], 2)[0]
     apart_variance = (between**2 / weights).sum()
-    dof = len(steps) - _POWERS
+    dof = len(steps) - _POWERS_OF_SCATTER
     return _Jacobian(
         value=np.tensordot(constant, slopes, (0, 0)),
         errors=np.sqrt(variance / dof) * residuals,
@@ -621,7 +623,9 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
         multipliers=multipliers,
         coefficients=coefficients_of(multipliers),
         covariance=np.cov(drawn, rowvar=False).reshape(k, k),
-        dof=_degrees(found.variance[rows], found.error[rows], pairs - _POWERS),
+        dof=_degrees(
+            found.variance[rows], found.error[rows], pairs - _POWERS_OF_SCATTER
+        ),
         bound=_bound(J + draws, v @ w) if k < d else 0.0,
         apart=apart,
     )

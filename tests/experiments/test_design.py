@@ -362,3 +362,9 @@ def test_inputs_in_another_order_are_refused():
         hj.experiments.simulate_experiments(model, design)
     other = hj.multisine(model.n_sections, periods=4, inputs=("force", "torque"))
     assert hj.experiments.simulate_experiments(model, other).inputs == model.inputs
+
+
+def test_a_random_input_has_a_sample():
+    message = "shorter than half of the time between samples, 0.02"
+    with pytest.raises(hj.errors.DefinitionError, match=message):
+        hj.experiments.random_input(1e-3, 50, bandwidth=8)

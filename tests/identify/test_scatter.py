@@ -190,6 +190,22 @@ def test_pairs_cancel_even_distortion(model):
         realized(model, 2).odd_part()
 
 
+def test_a_pair_with_a_failed_member_is_a_failed_one(model):
+    """Its inputs may be unknown."""
+    design = LINES.realizations(2).with_negatives()
+    data = hj.experiments.simulate_experiments(model, design, start="periodic")
+    inputs = np.array(data.u)
+    inputs[1] = np.nan
+    result = np.zeros(len(inputs), int)
+    result[1] = hj.errors.Result.BLOW_UP
+    broken = hj.experiments.ExperimentData(
+        inputs, data.y, n_sections=N, periods=P, result=result
+    )
+    pairs = broken.odd_part()
+    assert not pairs.ok[0]
+    assert pairs.ok[1:].all()
+
+
 def test_noise_by_its_ratio(model):
     data = realized(model, 1, 4)
     noisy = hj.experiments.add_noise(data, snr=20, seed=3)

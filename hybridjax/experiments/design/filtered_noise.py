@@ -34,7 +34,8 @@ def random_input(
 
     **Returns:** the samples (n, 1), with n the duration times the rate.
 
-    **Raises:** `DefinitionError` for a bandwidth of more than half the rate.
+    **Raises:** `DefinitionError` for a bandwidth of half the rate or more, a duration without a
+    sample, and too many samples.
 
     **Example:**
 
@@ -57,6 +58,11 @@ def random_input(
             f"`duration`, `rate` and `bandwidth` need {samples:.3g} samples, more than {PERIODS}."
         )
     n = round(duration * rate)
+    if n == 0:
+        raise DefinitionError(
+            f"`duration` = {duration:g} is shorter than half of the time between samples, "
+            f"{1 / rate:g}."
+        )
     pad = round(transient)
     sos = signal.butter(4, bandwidth, fs=rate, output="sos")
     white = np.random.default_rng(seed).normal(size=(n + 2 * pad, 1))

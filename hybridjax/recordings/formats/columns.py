@@ -164,7 +164,8 @@ class Wanted(NamedTuple):
         return not _with_groups(name).isdisjoint(_set(self.signals))
 
     def reaches(self, group: str) -> bool:
-        """Return whether a signal, or a member of a group, is wanted."""
+        """Return whether a signal, its group, or one of its members is wanted: `imu` is reached by
+        `imu.gyro.x`, and `imu.gyro.x` by `imu`."""
         if self.signals is None:
             return True
         within = not _with_groups(group).isdisjoint(_set(self.signals))
@@ -248,8 +249,8 @@ def check_rows(path: Path, rows: int, declared: Any, what: str) -> None:
 
 @contextmanager
 def reading(path: Path, kind: str) -> Iterator[None]:
-    """Turn errors of a library about broken bytes into a `FileFormatError`. (The library's text is
-    for the user, and nothing reads it.)
+    """Turn errors of a library about broken bytes into a `FileFormatError` with the library's
+    own text.
 
     Libraries stumble over broken bytes in any way, so that an error of any kind that one of their
     lines raises is about the file, unless it is about the computer. Errors that lines of this
