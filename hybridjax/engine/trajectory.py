@@ -44,8 +44,8 @@ from .watch import slopes
 # Values and rates of a guard are zero below this part of their terms. Smaller: rounding hides a
 # reset that ends on a guard. Larger: one that ends close to it is reported.
 _SAME = 1e-9
-# The part of a state's size by which it moves in a moment, in which a guard at rest begins to fall.
-# Smaller: rounding hides it. Larger: a guard that falls later is reported.
+# The moment in which a guard at rest begins to fall, as a part of the whole time. Smaller: rounding
+# hides it. Larger: a guard that falls later is reported.
 _MOMENT = 1e-6
 
 
@@ -389,7 +389,8 @@ def integrate(
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
     if new_input:
-        path = dataclasses.replace(path, findings=tuple(begins_beyond(s, begin, u)))
+        doubts = tuple(begins_beyond(s, begin, u, path.t[-1] - path.t[0]))
+        path = dataclasses.replace(path, findings=doubts)
     warn_of(path.findings)
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
@@ -481,9 +482,12 @@ def constant_input(system: HybridSystem, input: Any) -> Any:
     return namespace(value).broadcast_to(value, (nu,))
 
 
-def begins_beyond(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
-    """Doubts about a start at which guards are beyond zero, or at zero and fall, or begin to."""
-    for g, value, is_due in guards_reached(s, begin, u, at_rest=True):
+def begins_beyond(
+    s: Structure, begin: Lanes, u: np.ndarray, span: float
+) -> Iterator[Finding]:
+    """Doubts about a start, of a flow that takes a time `span`, at which guards are beyond zero, or
+    at zero and fall, or begin to."""
+    for g, value, is_due in guards_reached(s, begin, u, moment=_MOMENT * span):
         transition = s.transitions[g]
         name = transition.name
         if is_due:
@@ -507,12 +511,11 @@ def guards_reached(
     lane: Lanes,
     u: np.ndarray,
     instant: float = 0.0,
-    *,
-    at_rest: bool = False,
+    moment: float = 0.0,
 ) -> Iterator[tuple[int, float, bool]]:
     """The transitions of a lane whose guards are beyond zero, or fall to zero within an `instant`:
-    they have, or get at once, the sign that they have after their event. With `at_rest`, also those
-    at zero that begin to fall, as the height of a ball that is at rest on the ground.
+    they have, or get at once, the sign that they have after their event. Also those at zero that
+    begin to fall within a `moment`, as the height of a ball that is at rest on the ground.
 
     **Returns:** for each its index, the value of its guard, and whether it is at zero.
     """
@@ -524,7 +527,7 @@ def guards_reached(
     q = lane.q[:n]
     point = np.append(lane.t, q)
     rows, flow = _along(s, a, point, u)
-    begins = _begin_to_fall(s, a, point, flow, u) if at_rest else np.zeros(len(rows))
+    begins = _fall(s, a, point + moment * flow, u)
     for g, row, begin in zip(guards, rows, begins, strict=True):
         holds = kernels.enabled(s, s.member(g), lane.t, q, u)
         if not holds.all():
@@ -555,18 +558,11 @@ def _along(
     return values[..., 0], np.append(1.0, field[:, 0, 0])
 
 
-def _begin_to_fall(
-    s: Structure,
-    a: int,
-    point: Float[np.ndarray, " n1"],
-    flow: Float[np.ndarray, " n1"],
-    u: np.ndarray,
+def _fall(
+    s: Structure, a: int, point: Float[np.ndarray, " n1"], u: np.ndarray
 ) -> Bool[np.ndarray, " g"]:
-    """Whether each guard of chart a falls a moment later."""
-    speed = np.abs(flow[1:]).max()
-    size = 1 + np.abs(point[1:]).max()
-    moment = _MOMENT * size / speed if speed else 0.0
-    rows, flow = _along(s, a, point + moment * flow, u)
+    """Whether each guard of chart a falls at a time and state."""
+    rows, flow = _along(s, a, point, u)
     slopes = rows[:, 1 : 1 + len(point)]
     noise = _SAME * np.abs(slopes * flow).sum(axis=1)
     return slopes @ flow < -noise

@@ -336,7 +336,7 @@ def _next_crossing(
         _require_motion(map, moved.lanes)
         s = map.structure
         no_input = np.zeros((s.nu, 1))
-        doubts = begins_beyond(s, to_host(map.anchor), no_input)
+        doubts = begins_beyond(s, to_host(map.anchor), no_input, waited)
         causes = [f"One cause may be that {x.text} " for x in doubts]
         late = "".join(causes) or late
     return moved, late

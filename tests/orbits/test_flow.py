@@ -730,8 +730,9 @@ def test_events_at_the_start_and_at_the_end():
     thrown = hj.flow(ball(), up, 0.1)
     assert thrown.findings == ()
     rests = hj.Guess("main", (0.0, 0.0))
-    falls = hj.flow(ball(), rests, 0.1)
-    assert [x.cause for x in falls.findings] == ["on a guard"]
+    for unit in (1.0, 1e-9):
+        falls = hj.flow(ball(g=9.81 * unit), rests, 0.1)
+        assert [x.cause for x in falls.findings] == ["on a guard"]
     rises = hj.flow(ball(g=-9.81), rests, 0.1)
     assert rises.findings == ()
 

@@ -292,8 +292,7 @@ class Bodies:
         allowed = settings.rtol * larger
         allowed = allowed + settings.atol * scale
         # (Numbers that a chart does not use have no error.)
-        part = jnp.abs(error) / allowed
-        relative = jnp.where(error == 0, 0.0, part)
+        relative = jnp.where(error == 0, 0.0, jnp.abs(error) / allowed)
         error = still(jnp.max(relative, axis=-1, initial=0.0))
         return motion.join(course, y), error
 
@@ -352,11 +351,11 @@ class Bodies:
         if any(body.does == LEVEL for body in self.form.bodies):
             stages.append(lambda _, course, notes: (course, notes))
         jumping = Jumping(due, flags.entry, disabled=jnp.zeros_like(flags.left))
-        found = (now, jumping)
-        course, (_, jumping) = choose(motion, row.kind, stages, course, found)
+        notes = (now, jumping)
+        course, (_, jumping) = choose(motion, row.kind, stages, course, notes)
         ended = self._lane(self._ended, row)
-        seen_there = (flags, now, jumping)
-        course, (flags, *_) = motion.apply(ended, course, seen_there)
+        notes = (flags, now, jumping)
+        course, (flags, *_) = motion.apply(ended, course, notes)
         return course, flags
 
     def _aimed(self, a: int, row: Row, s: Structure, constants, course: Course, notes):

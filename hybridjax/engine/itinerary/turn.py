@@ -133,8 +133,8 @@ class _Steps:
         course, flags = self.travelers.each(of_lane)(*constants.begin, ends)
         # (Rows at which no piece begins write into one more place.)
         kept = lambda x: jnp.zeros((self.form.pieces + 1, *x.shape))  # noqa: E731
-        state = (course.t, course.y, course.delay, course.rate)
-        begun = _Begun(*map(kept, state))
+        at_begin = (course.t, course.y, course.delay, course.rate)
+        begun = _Begun(*map(kept, at_begin))
         return _State(course, begun), flags
 
     def take(self, constants: Constants, k, state: "_State", flags: Flags):
@@ -241,10 +241,9 @@ def _passage(
     ends = jnp.concatenate([begun.y[1:K], course.y[None]])
     factors = ends[..., 1:, :]
     if form.sections and columns:
-        all_delays = [begun.delay[1:K], course.delay[None]]
-        delays = jnp.concatenate(all_delays)
-        first_column = delays[..., None]
-        factors = jnp.concatenate([first_column, factors], axis=-1)
+        delays = jnp.concatenate([begun.delay[1:K], course.delay[None]])
+        of_time = delays[..., None]
+        factors = jnp.concatenate([of_time, factors], axis=-1)
     last = lambda x: jnp.moveaxis(x, 0, 1) if many else x  # noqa: E731
     return Passage(
         course.t,
