@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.recordings import natural
 from hybridjax.recordings.inspection.answers import feedback
 
 
@@ -149,6 +150,19 @@ def test_intervals_of_few_blocks_are_wider_than_percentiles():
     plain = np.ptp(np.quantile(moduli, [0.025, 0.975]))
     length = np.ptp(found.interval()[0])
     assert 1.1 < length / plain < 1.4
+
+
+def test_draws_keep_blocks_of_successive_cycles():
+    """What successive cycles have in common stays: counts of two neighbors in blocks of b cycles
+    have a correlation of 1 - 1 / b. No block reaches over the end of a record."""
+    records = np.repeat([0, 1], [150, 50])
+    counts = natural._resampled(records, 10, np.random.default_rng(0))
+    assert np.all(counts[:, :150].sum(axis=1) == 150)
+    assert np.all(counts[:, 150:].sum(axis=1) == 50)
+    inside = counts[:, 20:130] - counts[:, 20:130].mean()
+    products = inside[:, 1:] * inside[:, :-1]
+    correlation = products.mean() / inside.var()
+    np.testing.assert_allclose(correlation, 0.9, atol=0.01)
 
 
 def turning(modulus, angle, cycles, seed):
