@@ -124,7 +124,9 @@ def require_among(
         if name not in among:
             known = ", ".join(among) or "none"
             meant = slip_of(name, among)
-            lead = "" if meant is None else f": use '{meant}'"
+            # (A signal may have the name, and another unit.)
+            is_other = meant is not None and meant != str(name)
+            lead = f": use '{meant}'" if is_other else ""
             raise DefinitionError(
                 f"{where}there is no {kind} '{name}'; {kind}s are {known}{lead}."
             )

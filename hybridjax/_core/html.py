@@ -86,11 +86,15 @@ def multiplier_table(
     values: Complex[np.ndarray, " d"], errors: Float[np.ndarray, " d"] | None = None
 ) -> str:
     """The multipliers, their standard errors if they are given, and their moduli."""
-    columns = {"multiplier": [number(z) for z in values]}
-    if errors is not None:
-        columns["multiplier"] = [*map(rounded, values, errors)]
-        known = [standard_error(x) if np.isfinite(x) else "unknown" for x in errors]
-        columns["± standard error"] = known
+    if errors is None:
+        columns = {"multiplier": [number(z) for z in values]}
+    else:
+        columns = {
+            "multiplier": [*map(rounded, values, errors)],
+            "± standard error": [
+                standard_error(x) if np.isfinite(x) else "unknown" for x in errors
+            ],
+        }
     columns["modulus"] = [f"{abs(z):.6g}" for z in values]
     return table(tuple(columns), zip(*columns.values(), strict=True))
 

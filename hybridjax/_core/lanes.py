@@ -239,8 +239,12 @@ def _moving(primal: Any, tangent: Any) -> tuple[Any, Any, Any]:
 def value_and_columns(
     function: Callable, moving: Any, still: Any, directions: Any
 ) -> tuple[Any, Any]:
-    """The value of a function of a tree, of which the part `moving` has derivatives, and those of
-    its numbers in P directions: trees of the form of `moving` with arrays (P, ...)."""
+    """The value of a function of a tree, and its derivatives in P directions: arrays (P, ...), in
+    the form of the value.
+
+    **Arguments:** `moving`: the part of the tree that has derivatives; `still`: the rest.
+    `directions`: of the form of `moving`, with arrays (P, ...).
+    """
 
     def of(moving):
         value = function(eqx.combine(moving, still))

@@ -56,8 +56,8 @@ def real(x: Any) -> jax.Array:
     """`x` as an array of floating-point numbers: a converter for fields of definitions.
 
     Numbers of Python and NumPy keep their digits also where JAX is switched to 64 bits later, so
-    that a definition may be built before. They have values inside of programs, too: what is known
-    while a program is traced need not be searched by it. Arrays of JAX remain what they are.
+    that a definition may be built before. They keep their values while a program is traced, so that
+    what depends on them alone is computed outside of it. Arrays of JAX remain what they are.
     """
     leaves = jax.tree_util.tree_leaves(x)
     if any(isinstance(leaf, jax.Array) for leaf in leaves):

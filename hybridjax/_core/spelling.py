@@ -6,11 +6,11 @@ from collections.abc import Collection
 
 # Likeness of two spellings, from 0 to 1, at which one is taken for a slip in the other. Lower:
 # names of other things are suggested. Higher: slips lead nowhere.
-SLIP = 0.85
+_SLIP = 0.85
 
 
 def spelled_alike(
-    name: str, among: Collection[str], likeness: float = SLIP
+    name: str, among: Collection[str], likeness: float = _SLIP
 ) -> str | None:
     """Return the name that is spelled most alike; None if none is alike."""
     alike = difflib.get_close_matches(name, among, n=1, cutoff=likeness)

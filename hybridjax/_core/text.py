@@ -127,8 +127,8 @@ def _exponent(x: Any) -> int:
 
 
 def _to_places(x: float, places: int, sign: str = "-", most: int = _MOST_DIGITS) -> str:
-    """A number with these decimals; of less than one, digits are left out at its end. Powers of ten
-    stand where zeros would be many."""
+    """A number with so many decimals; a negative count rounds to tens, hundreds, and so on. Powers
+    of ten stand where zeros would be many."""
     x = round(x, places) + 0.0  # (no -0)
     if places > most or places < -2:
         digits = max(_exponent(abs(x)) + places, 0) if x else 0

@@ -127,17 +127,17 @@ def _about_bumps(name: str, family: Any) -> dict:
     f = np.asarray(family.exact.frequencies)
     H_0 = np.asarray(family.exact[0])[:, :, 0]
     size = np.log(np.abs(H_0))
-    found = []
+    has_bumps = []
     places = []
     for k, output in enumerate(OUTPUTS):
         maxima, _ = find_peaks(size[:, k], prominence=0.01)
         peaks = f[maxima]
         peaks = peaks[(peaks > 1.5) & (peaks < 2.5)]
-        found.append(len(peaks) > 0)
+        has_bumps.append(len(peaks) > 0)
         listed = ", ".join(f"{x:.3g}" for x in peaks) or "none"
         places.append(f"{listed} ({output})")
     text = f"local maxima of |H_0| for f in (1.5, 2.5): {'; '.join(places)}"
-    return _noted(f"{name}: bumps of H_0 around f = 2", any(found), text)
+    return _noted(f"{name}: bumps of H_0 around f = 2", any(has_bumps), text)
 
 
 def _about_higher_harmonics(name: str, family: Any) -> dict:

@@ -162,10 +162,8 @@ class HarmonicStateSpace(NamedTuple):
         """Responses of all harmonics to inputs of `frequencies` (F,) in cycles per period."""
         M = 2 * self.order + 1
         # (Inputs have the harmonic 0 only.)
-        by_turn = self.B.reshape(len(self.B), M, -1)
-        B = by_turn[:, self.order]
-        direct = self.D.reshape(len(self.D), M, -1)
-        D = direct[:, self.order]
+        B = self.B.reshape(len(self.B), M, -1)[:, self.order]
+        D = self.D.reshape(len(self.D), M, -1)[:, self.order]
         f = np.asarray(frequencies).reshape(-1, 1, 1)
         rates = 2j * np.pi * f / period
         resolvent = rates * np.eye(len(self.A)) - self.A

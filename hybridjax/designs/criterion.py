@@ -127,8 +127,8 @@ class Criterion(eqx.Module):
         bounds = [criterion.bound(power) for criterion in self.each]
         criteria = np.array([bound.criterion for bound in bounds])
         top = criteria.max()
-        relative = np.mean((criteria / top) ** self.exponent)
-        mean = top * relative ** (1 / self.exponent)
+        mean_power = np.mean((criteria / top) ** self.exponent)
+        mean = top * mean_power ** (1 / self.exponent)
         share = (criteria / mean) ** (self.exponent - 1) / len(criteria)
         variances = (
             share @ np.array([bound.variances for bound in bounds]) / share.sum()

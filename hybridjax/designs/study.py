@@ -357,8 +357,8 @@ class SequentialDesign(Showable, eqx.Module):
         usual = (plan.usual_standard_errors**2).sum() * plan.usual.cycles(0)
         equal = usual / (_standard_errors(best.by_level, self.goal) ** 2).sum()
         usual_name = plan.usual_name.capitalize()
-        cycles = float(f"{equal:.3g}")
-        need = f"would need about {cycles:.0f} cycles for the same standard errors"
+        cycles = f"{float(f'{equal:.3g}'):.0f}" if equal >= 10 else f"{equal:.2g}"
+        need = f"would need about {cycles} cycles for the same standard errors"
         comparison = f"{usual_name} {need}."
         if self.done:
             return comparison

@@ -252,8 +252,8 @@ def roundness(
     part = np.divide(np.abs(turned), square, out=np.zeros_like(square), where=shaped)
     expected = 1 - 2 / np.maximum(count, 1)
     mean = np.where(count > 2, expected, 1)
-    found = (1 - np.minimum(part, 1) ** 2) / mean
-    return np.where(shaped, found, 1.0)
+    roundness = (1 - np.minimum(part, 1) ** 2) / mean
+    return np.where(shaped, roundness, 1.0)
 
 
 def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:

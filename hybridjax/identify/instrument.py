@@ -204,8 +204,8 @@ def excited_classes(
     size = np.sqrt(_diagonal(power))
     strong = size > threshold * size.max()
     scale = np.where(strong, size, 1)
-    by_column = power / scale[:, :, None]
-    relative = by_column / scale[:, None]
+    by_row = power / scale[:, :, None]
+    relative = by_row / scale[:, None]
     least = np.linalg.eigvalsh(relative)[:, 0]
     whole = strong.all(axis=1) & (least > SILENT_LINE)
     if whole.any():
@@ -341,8 +341,8 @@ def _solve_classes(
     left = spread @ block(u, u) - np.eye(len(u))
     edge = _diagonal(left @ spread) / by_input
     counted = dof + _diagonal(left).sum(axis=1)
-    twice = counted[:, None, None] + 2 * edge[:, None]
-    total = variance(G, twice)
+    widened = counted[:, None, None] + 2 * edge[:, None]
+    total = variance(G, widened)
     taken = _diagonal(left @ left).sum(axis=1) / counted**2
     return _ClassEstimates(
         H=H,

@@ -371,8 +371,8 @@ class MultiplierFit(Fit):
                 continue
             # (As many digits as the interval leaves.)
             width = max(bounds[1] - bounds[0], 1e-12)
-            magnitude = -np.log10(width / 2)
-            digits = max(2, int(np.ceil(magnitude)))
+            decimals = -np.log10(width / 2)
+            digits = max(2, int(np.ceil(decimals)))
             low, high = np.maximum(bounds, 0.0)
             shown.append(
                 f"{modulus:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
@@ -491,8 +491,8 @@ def left_out(higher: Callable[[], RoughFit]) -> list[Finding]:
     with suppress(DefinitionError):
         coefficients, covariance = higher()
         matrix, dof = covariance()
-        last = coefficients[-1] ** 2
-        distance = float(last / matrix[-1, -1])
+        last = coefficients[-1]
+        distance = float(last**2 / matrix[-1, -1])
         if _tail(distance, 1, dof) < _NEEDED:
             order = len(coefficients)
             text = (

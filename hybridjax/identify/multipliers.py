@@ -357,9 +357,9 @@ def compare_orders(htf: HTF, max_order: int, extra_lags: int | None) -> OrderSel
     if htf.variance is None:
         likelihood = data * np.log(np.maximum(cost, 1e-300))
     else:
-        most = weights.largest_misfit(htf)
-        usual = cost[-1] / dof[-1]
-        level, _ = weights.estimated_noise(most, usual)
+        largest_misfit = weights.largest_misfit(htf)
+        misfit = cost[-1] / dof[-1]
+        level, _ = weights.estimated_noise(largest_misfit, misfit)
         likelihood = cost / level
     exact = bool(noise.max() < ROUNDING)
     values, spread = noise_ratios(largest, htf, c, exact)

@@ -293,7 +293,7 @@ def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
         columns, _ = late_columns(group, a)
-        first = -columns[:, 0]
-        a, *_ = np.linalg.lstsq(columns[:, 1:], first)
+        target = -columns[:, 0]
+        a, *_ = np.linalg.lstsq(columns[:, 1:], target)
         if step in _STARTS:
             yield a

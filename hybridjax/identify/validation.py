@@ -147,23 +147,25 @@ class Validation(Showable, eqx.Module):
         return super().plot(cycles=cycles, ax=ax)
 
     @property
+    def _threshold(self) -> float:
+        """p value below which one of all outputs fails a test (Bonferroni)."""
+        return self.alpha / len(self.outputs)
+
+    @property
     def white(self) -> bool:
         """True if the residuals of all outputs may be white."""
-        threshold = self.alpha / len(self.outputs)
-        return bool(np.min(self.whiteness) >= threshold)
+        return bool(np.min(self.whiteness) >= self._threshold)
 
     @property
     def independent(self) -> bool:
         """True if the residuals of all outputs may be independent of the inputs."""
-        threshold = self.alpha / len(self.outputs)
-        return bool(np.min(self.independence) >= threshold)
+        return bool(np.min(self.independence) >= self._threshold)
 
     @property
     def unexplained(self) -> tuple[str, ...]:
         """Outputs that the model predicts no better, beyond chance, than their mean cycle does."""
         pairs = zip(self.outputs, self.no_better, strict=True)
-        threshold = self.alpha / len(self.outputs)
-        return tuple(name for name, p in pairs if p > threshold)
+        return tuple(name for name, p in pairs if p > self._threshold)
 
     def __repr__(self) -> str:
         names = [listed([name]) for name in self.outputs]

@@ -226,8 +226,7 @@ class Tiles(NamedTuple):
         anchor, period, turn, codes, together = self._turn(rows, anchor, period)
         scale = np.asarray(self.map.settings.scale)
         sizes = scale[anchor.chart[:, 0]]
-        ratio = turn.jacobian * sizes[:, None, :]
-        jacobian = ratio / sizes[:, :, None]
+        jacobian = turn.jacobian * sizes[:, None, :] / sizes[:, :, None]
         step = newton_steps(jacobian, turn.residual / sizes)
         q = anchor.q[..., 0] + step * sizes
         size = excess(q / sizes, step)

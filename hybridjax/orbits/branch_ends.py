@@ -176,9 +176,8 @@ def _near_guard(cycle: LimitCycle, visits: list[Visit]) -> End | None:
             if _has_minimum(level, near):
                 text = f"the guard of '{name}' is touched tangentially (grazing)"
                 return End(Result.GRAZING, text)
-            least = np.argmin(level[:-1])
-            is_least_at_begin = least == 0 and level[0] <= near
-            if before.event >= 0 and g != before.event and is_least_at_begin:
+            least_at_begin = np.argmin(level[:-1]) == 0 and level[0] <= near
+            if before.event >= 0 and g != before.event and least_at_begin:
                 earlier = s.transitions[before.event].name
                 text = f"the event '{name}' begins to happen at once after '{earlier}'"
                 return End(Result.EVENT_ORDER, text)

@@ -206,8 +206,7 @@ def _functions(s: Structure, a: int) -> Iterator[tuple[str, Callable]]:
 
     yield f"the field of chart '{s.names[a]}'", field
     for k, g in enumerate(s.guards(a)):
-        guard_of = _guard(s, a, k)
-        yield f"the guard of '{s.transitions[g].name}'", guard_of
+        yield f"the guard of '{s.transitions[g].name}'", _guard(s, a, k)
     for g in s.guards(a) + s.schedules(a):
         name = s.transitions[g].name
         yield f"the reset of '{name}'", _reset(s, g)

@@ -184,8 +184,7 @@ def _transfer(
     size = map.sizes
     column = size[:, None]
     scaled = whole * size / column
-    turns = -2j * np.pi * f
-    back_a_period = xp.exp(turns)[:, None, None]
+    back_a_period = xp.exp(-2j * np.pi * f)[:, None, None]
     turned = xp.eye(d) - back_a_period * scaled
     right = end[..., :nu] / column
     start = solve(turned, right) * column

@@ -165,7 +165,7 @@ class Flow(Showable, eqx.Module):
         chart, states = states_at(path, np.asarray(self.request.u), times)
         if path.result == Result.SIMULTANEOUS:
             states = np.full_like(states, np.nan)
-        return chart, states
+        return jnp.asarray(chart), jnp.asarray(states)
 
     def __repr__(self):
         name = type(self.system).__name__

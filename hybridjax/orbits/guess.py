@@ -391,10 +391,10 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         signal: Any = plane.signal
         point = np.asarray(signal.point)
         normal = np.asarray(signal.normal)
-        from_point = moves.q[:n] - point[:, None]
-        before = normal @ from_point
-        to_point = ends[:n] - point[:, None]
-        after = normal @ to_point
+        begins_from_point = moves.q[:n] - point[:, None]
+        before = normal @ begins_from_point
+        ends_from_point = ends[:n] - point[:, None]
+        after = normal @ ends_from_point
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)
         # (It meets the plane where the piece begins, with the move before and that after.)
         meets[begins[k] - 1 : begins[k] + 1] = False
@@ -444,7 +444,6 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
     # (The equilibrium is known to a part of the sizes: what is less is zero.)
-    magnitude = np.abs(lane.q[:n, 0])
     known = magnitude > _REST * scale
     place = np.where(known, lane.q[:n, 0], 0.0)
     place = signal_values(s.states(a), place)

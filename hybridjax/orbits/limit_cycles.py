@@ -155,8 +155,8 @@ class LimitCycles(Showable, eqx.Module):
     @remembered
     def _multipliers(self) -> Complex[np.ndarray, "S d"]:
         products = turn_product(np.asarray(self.factors))
-        found = np.where(self.ok[:, None, None], products, 0.0)
-        values = np.linalg.eigvals(found)
+        of_found = np.where(self.ok[:, None, None], products, 0.0)
+        values = np.linalg.eigvals(of_found)
         moduli = np.round(np.abs(values), 12)
         order = np.lexsort((-np.imag(values), -moduli), axis=-1)
         values = np.take_along_axis(values.astype(complex), order, axis=-1)

@@ -341,8 +341,8 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         return (~settled & (found.turns < MOST_TURNS)).any()
 
     # (A first turn before the loop would be compiled twice.)
-    none = jnp.zeros(q.shape[:-1], bool)
-    begin = _nothing_yet(q, ends), q, none
+    unsettled = jnp.zeros(q.shape[:-1], bool)
+    begin = _nothing_yet(q, ends), q, unsettled
     return jax.lax.while_loop(going, again, begin)[0]
 
 
@@ -569,5 +569,5 @@ def agrees(route: Route, q, check: Check) -> Bool[Array, "*L"]:
     difference = xp.abs(other.q - q)
     apart = xp.max(difference / route.map.sizes, axis=-1)
     same = xp.isfinite(apart) & (apart <= _APART)
-    is_rough = other.error <= _ROUGH
-    return same & check.periodic & is_rough & ~other.left
+    is_accurate = other.error <= _ROUGH
+    return same & check.periodic & is_accurate & ~other.left

@@ -313,8 +313,8 @@ class Responses(Showable, eqx.Module):
         else:
             wave = xp.asarray(push(phase), float)
         n = np.arange(harmonics + 1)
-        turns = -2j * np.pi * n[:, None]
-        waves = xp.exp(turns * phase)
+        exponent = -2j * np.pi * n[:, None] * phase
+        waves = xp.exp(exponent)
         weight = waves * weight
         wave = weight @ wave
         response = weight @ Z
@@ -324,8 +324,8 @@ class Responses(Showable, eqx.Module):
         c = xp.conj(response) * wave / period
         if on_host(c):
             last_quarter = c[len(c) * 3 // 4 :]
-            left_out = np.abs(last_quarter).max()
-            if left_out > 1e-3 * np.abs(c).max():
+            largest_late = np.abs(last_quarter).max()
+            if largest_late > 1e-3 * np.abs(c).max():
                 raise DefinitionError(
                     f"`harmonics` = {harmonics} does not resolve jumps of the push."
                 )

@@ -498,11 +498,11 @@ class ReturnMap(eqx.Module):
         error = longest * xp.abs(rate)
         here = belongs(s, lanes.chart)[:-1]
         u = xp.zeros((s.nu, len(lanes.t)))
+        structure = self._structure_of(lanes)
         holds = []
         for g, transition in enumerate(s.transitions):
             source = lanes.chart == s.chart_index(transition.source)
             which = xp.where(source, np.int32(g), np.int32(-1))
-            structure = self._structure_of(lanes)
             holds.append(enabled(structure, lanes.t, lanes.q, u, which))
         codes = turn.codes.reshape(*shape, -1)
         fired = [xp.any(codes == g, axis=-1) for g in range(len(s.transitions))]

@@ -76,24 +76,24 @@ def fixed_point(
     x = moves.q[:, 0] / sizes
     before = np.inf
     # (A piece without a move cannot be shifted.)
-    every_piece_moves = (moves.order == 0).sum() == PIECES
-    while every_piece_moves:
+    if (moves.order == 0).sum() != PIECES:
+        return otherwise, None
+    while True:
         step, shift, h = _shift(map, moves, x, target)
-        states = shift[:, 1:]
-        in_sizes = states / map.scale[moves.chart]
+        moved = shift[:, 1:]
+        in_sizes = moved / map.scale[moves.chart]
         length = np.max(np.abs(in_sizes))
         if not length <= 0.5 * before:
-            break
+            return otherwise, None
         x = x + step
         t = moves.t + shift[:, 0]
-        q = moves.q + shift[:, 1:].T
+        q = moves.q + moved.T
         moves = moves._replace(t=t, q=q, h=h)
         # (The error after a step is about its square.)
         rtol = np.asarray(map.settings.rtol)
         if length <= np.maximum(CLOSED, rtol):
             return x, _forwards(moves)
         before = length
-    return otherwise, None
 
 
 def _shift(
@@ -188,8 +188,7 @@ def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple
     pieces, moved, tape, gap = followed
     if gap > CLOSED:
         return None
-    last = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
-    end = last
+    end = jax.tree_util.tree_map(lambda x: x[..., -1:], moved.lanes)
     returned = np.where(map.valid, end.q[:, 0], 0.0)
     off, _ = map.held(q)
     residual = returned - q - off

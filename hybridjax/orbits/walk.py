@@ -272,7 +272,6 @@ def _between(
     path = []
     for z in _FRACTIONS:
         lower = q0 + rate0 * z + bend0 / 2 * z**2
-        fifth_power = fifth * z**5
-        higher = third * z**3 + fourth * z**4 + fifth_power
+        higher = third * z**3 + fourth * z**4 + fifth * z**5
         path.append((t + z * length, lower + higher))
     return path

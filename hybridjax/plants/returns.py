@@ -501,7 +501,7 @@ def _fitted(
     residuals = slopes - fitted
     # (Of unit weight.)
     residuals = residuals * np.sqrt(weights)[:, None, None]
-    # (The Jacobian is the constant of a fit with one more power.)
+    # (The Jacobian is the constant J of a fit by J + c step^2.)
     constant = _solution(steps, 2)[0]
     variance = (constant**2 / weights).sum()
     between = np.zeros_like(steps)

@@ -88,8 +88,9 @@ def section_data(data: SectionData, *, ax: AxesLike | None = None) -> Plot:
             if i < nu:
                 _draw_spectrum(last, data, i)
             else:
-                at_most_spread = x[at == np.argmax(std)]
-                last.plot(at_most_spread, lw=0.5, color=CYCLE[1])
+                # (At the section where it scatters most.)
+                widest = x[at == np.argmax(std)]
+                last.plot(widest, lw=0.5, color=CYCLE[1])
                 last.set_xlabel("cycle")
                 last.sharey(spread)
                 last.tick_params(labelleft=False)

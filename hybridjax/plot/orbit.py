@@ -219,17 +219,18 @@ def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
         if not any(name in there for there in texts.values()):
             texts.setdefault(tuple(before.round(9)), {})[name] = None
     ax.autoscale_view()
-    lines = [np.transpose(orbit(*names)[1:])]
     solid = [x for x in ax.get_lines() if x.get_linestyle() == "-"]
-    lines += [np.asarray(x.get_xydata()) for x in solid]
-    drawn = [*ax.transData.transform(np.vstack(lines))]
+    lines = [np.asarray(x.get_xydata()) for x in solid]
+    drawn = ax.transData.transform(np.vstack(lines))
     boxes: list[Bbox] = []
     # (Long names first: short ones find a place beside them.)
     for point, there in sorted(texts.items(), key=lambda x: -max(map(len, x[1]))):
         boxes.append(_text(ax, "\n".join(there), point, center, drawn, boxes))
 
 
-def _text(ax: Axes, text: str, point, center, drawn: list, others: list[Bbox]) -> Bbox:
+def _text(
+    ax: Axes, text: str, point, center, drawn: np.ndarray, others: list[Bbox]
+) -> Bbox:
     """A text beside `point`, rather towards `center`, that covers the fewest of the pixels drawn
     and no other text.
 

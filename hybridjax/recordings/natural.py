@@ -194,8 +194,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         half = reach * drawn.std(axis=0)
         pair = np.stack([center - half, center + half], axis=1)
         ends = np.abs(pair)
-        is_one_sided = half < np.abs(center)
-        low = np.where(is_one_sided, ends.min(axis=1), 0.0)
+        excludes_zero = half < np.abs(center)
+        low = np.where(excludes_zero, ends.min(axis=1), 0.0)
         return np.stack([low, ends.max(axis=1)], axis=1)
 
     def __repr__(self) -> str:
@@ -572,12 +572,13 @@ def _resampled(
 ) -> Float[np.ndarray, "B K"]:
     """Draw blocks of each record, or whole records, and return how often each cycle is in each
     draw."""
-    names, counts = np.unique(records, return_counts=True)
-    if block == counts.max():
-        chosen = [rng.choice(names, len(names)) for _ in range(_DRAWS)]
-        is_drawn = records[:, None] == np.array(chosen)[:, None, :]
-        return is_drawn.sum(axis=2).astype(float)
+    names, place, counts = np.unique(records, return_inverse=True, return_counts=True)
     weights = np.zeros((_DRAWS, len(records)))
+    if block == counts.max():
+        for row in weights:
+            chosen = rng.choice(len(names), len(names))
+            row[:] = np.bincount(chosen, minlength=len(names))[place]
+        return weights
     cycles = [np.flatnonzero(records == name) for name in names]
     for row in weights:
         for own in cycles:

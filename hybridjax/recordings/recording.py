@@ -46,7 +46,9 @@ class Trial(eqx.Module):
     name: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return f"Trial({_summary(self).strip()})"
+        # (JAX makes trees with other leaves of it.)
+        is_series = isinstance(self.time, np.ndarray) and len(self.time) > 1
+        return f"Trial({_summary(self).strip() if is_series else self.name})"
 
 
 @checked

@@ -162,6 +162,7 @@ def test_a_sample_at_an_event_is_the_state_after_it():
     _, states = found.at(first)
     rebound = 0.7 * 9.81 * FIRST
     assert_allclose(states[0, 1], rebound, rtol=1e-12)
+    assert isinstance(states, jax.Array)  # as all arrays of a flow
 
 
 class Thermostat(hj.HybridSystem):

@@ -1,5 +1,6 @@
 """Recordings, their files, and what is refused."""
 
+import jax
 import numpy as np
 import pytest
 
@@ -263,3 +264,12 @@ def test_a_recording_that_is_too_short_is_refused(rhythm, strides):
     with pytest.raises(hj.errors.DefinitionError, match="too few|reach beyond"):
         crossing = hj.Crossing(outputs[0], "rising")
         hj.identify_recording(short, crossing, **names)
+
+
+def test_a_trial_without_series_prints_its_name():
+    """Trees that JAX makes of it hold other leaves."""
+    recording = hj.Recording([0.0, 1.0, 2.0], {"a": [1.0, 2.0, 1.0]})
+    (trial,) = recording.trials
+    other = jax.tree_util.tree_map(lambda _: None, trial)
+    assert repr(other) == f"Trial({trial.name})"
+    assert "3 samples" in repr(trial)

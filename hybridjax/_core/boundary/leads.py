@@ -23,7 +23,7 @@ from .values import Kind, Number, show, with_article
 _LISTED = 24
 
 
-# Likeness of two spellings at which one is the last guess for the other; see `SLIP`.
+# Likeness of two spellings at which one is the last guess for the other; see `spelling.py`.
 _ALIKE = 0.7
 
 
@@ -348,7 +348,8 @@ def about_percent(kind: Kind | None, value: Any) -> str:
     if not isinstance(kind, Number) or not isinstance(value, int | float):
         return ""
     is_share = max(kind.low, kind.above) == 0 and min(kind.high, kind.below) == 1
-    return f": {value:g} % is {value / 100:g}" if is_share and 1 < value <= 100 else ""
+    # (Smaller numbers may be no percentages.)
+    return f": {value:g} % is {value / 100:g}" if is_share and 5 <= value <= 100 else ""
 
 
 def _about_object(function: str, kind: Kind | None, value: Any) -> str:

@@ -137,8 +137,8 @@ def _arctan2(y, x):
     r = jax.lax.select(steep, (ratio - 1) / (ratio + 1), ratio)
     z = r * r
     angle = r + r * z * _polynomial(n.arctan, z)
-    beyond = jnp.pi / 4 + (angle + n.pi_4_low)
-    angle = jax.lax.select(steep, beyond, angle)
+    steep_angle = jnp.pi / 4 + (angle + n.pi_4_low)
+    angle = jax.lax.select(steep, steep_angle, angle)
     beyond_diagonal = jnp.pi / 2 - (angle - 2 * n.pi_4_low)
     angle = jax.lax.select(ay > ax, beyond_diagonal, angle)
     left = jnp.pi - (angle - 4 * n.pi_4_low)

@@ -141,8 +141,8 @@ def transfer_slopes(
                 for name, shape in shapes.items()
             }
             N = model.n_sections
-            angles = -2j * np.pi / N * n * m
-            waves = np.exp(angles) / N
+            exponents = -2j * np.pi / N * n * m
+            waves = np.exp(exponents) / N
             after = later[n].reshape(-1, *w.shape[:3])  # (d, M, F, ny)
             _fill(blocks, coordinates, n, states[n], after, waves, w)
         yield rows, slopes
@@ -194,8 +194,8 @@ def states_at(
     N = model.n_sections
     nu = model.B[0].shape[1]
     phi = model.monodromy()
-    angles = -2j * np.pi / N * f
-    back = np.exp(angles)[:, None]
+    exponents = -2j * np.pi / N * f
+    back = np.exp(exponents)[:, None]
 
     def around(x):
         states = []
@@ -204,10 +204,9 @@ def states_at(
             x = (_real_times(A, x) + B[:, None, :]) * back
         return states, x
 
-    none = np.zeros((len(phi), len(f), nu), complex)
-    _, forced = around(none)
-    turns = -2j * np.pi * f
-    back_a_period = np.exp(turns)[:, None, None]
+    at_rest = np.zeros((len(phi), len(f), nu), complex)
+    _, forced = around(at_rest)
+    back_a_period = np.exp(-2j * np.pi * f)[:, None, None]
     turn = phi * back_a_period
     resolvent = np.linalg.inv(np.eye(len(phi)) - turn)
     states, _ = around(np.einsum("fab,bfj->afj", resolvent, forced))

@@ -192,8 +192,7 @@ class SeriesFit(MultiplierFit):
             return divided_by_chi(by_harmonic, c, f, N, self.lead)
 
         H = sum_up(self.numerators)
-        turns = np.exp(-2j * np.pi * f)
-        period_delay = turns[:, None, None]
+        period_delay = np.exp(-2j * np.pi * f)[:, None, None]
         below = chi(period_delay, c)
         numbers = np.arange(1, len(c) + 1)
         lags = numbers[:, None, None, None, None]
@@ -201,9 +200,8 @@ class SeriesFit(MultiplierFit):
         slope = sum_up(self.slopes) - of_chi
         by_c = np.einsum("amfij,ab,bmfij->mfij", slope, self.covariance, slope.conj())
         r = np.arange(self.numerators.shape[1]) - self.lead
-        angles = np.outer(f, r)
-        rates = -2j * np.pi / N
-        powers = np.exp(rates * angles)
+        exponent = -2j * np.pi / N * np.outer(f, r)
+        powers = np.exp(exponent)
         spread = np.tensordot(powers, self.roots, axes=(1, 2))  # (F, N, ny, nu, r)
         square = np.abs(spread / N) ** 2
         power = square.sum(axis=(1, 4))
@@ -705,18 +703,18 @@ def block_scores(
     filtered = sum(part.filtered for part in parts)
     # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
     first, second = squares[:, 1:].mean(axis=1)
-    total = solution.dof.sum()
-    white = np.array([[total, first], [first, second]])
+    dof = solution.dof.sum()
+    white = np.array([[dof, first], [first, second]])
     of_white, of_filtered = amounts(white, squares[:, 0])
     drawn = score[:, 1:]
     by_filtered = np.einsum("bcd,bce->de", drawn, drawn) / _FILTERED_DRAWS
-    expected = of_white * by_white.sum(axis=0) + of_filtered * by_filtered
+    expected_by_white = by_white.sum(axis=0)
+    expected = of_white * expected_by_white + of_filtered * by_filtered
     true = of_white * solution.curvature.sum(axis=0) + of_filtered * filtered
     # In units in which noise like that of the data makes the sum one.
     try:
         half = np.linalg.inv(np.linalg.cholesky(expected))
         true = np.linalg.cholesky(true)
-        expected_by_white = by_white.sum(axis=0)
         share = np.linalg.inv(np.linalg.cholesky(expected_by_white))
     except np.linalg.LinAlgError:
         return None

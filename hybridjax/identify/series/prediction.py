@@ -211,8 +211,7 @@ class SeriesProblem(NamedTuple):
         along = np.zeros((R, starts, 1))
         for n, x in enumerate(recursion(F, shape, enter, drive, filled)):
             error = model.C[n] @ x
-            predicted = error[..., 0]
-            error[..., 0] = y[n] - predicted
+            error[..., 0] = y[n] - error[..., 0]
             error = part.without_drift(n, error)
             white = whiten[n] @ error
             samples = white.shape[1] * white.shape[2]
@@ -235,8 +234,8 @@ class SeriesProblem(NamedTuple):
         for n, x in enumerate(states):
             predicted = x @ model.C[n].T
             innovation = y[n] - predicted
-            measured = innovation * part.sampled[n]
-            entering.append(np.matvec(given[n], measured))
+            known = innovation * part.sampled[n]
+            entering.append(np.matvec(given[n], known))
         return Path(
             F=F,
             gain=gain,

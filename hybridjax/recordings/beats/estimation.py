@@ -501,11 +501,11 @@ def carried_over(intervals: Intervals, fit: CurveFit) -> Carried:
     white = whitened(intervals, fit)
     response = fit.forecast.duration - 1 / fit.rates[intervals.trial]
     before = np.zeros(len(response))
-    is_followed = follows(intervals, fit)
-    before[1:] = np.where(is_followed, response[:-1], 0.0)
+    is_next = follows(intervals, fit)
+    before[1:] = np.where(is_next, response[:-1], 0.0)
     errors = projected(intervals, fit, white)
-    last = fit.forecast.slopes[:, -1:]
-    by_rate = white(last)[:, 0]
+    of_rate = fit.forecast.slopes[:, -1:]
+    by_rate = white(of_rate)[:, 0]
     parts = without_rates(intervals, by_rate, white(before[:, None]))
     column = parts.rest[:, 0]
     across = errors.across

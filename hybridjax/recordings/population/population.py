@@ -604,8 +604,7 @@ def _test(
     subjects = np.arange(n if paired else 2 * n)
     group = subjects // n
     x = np.eye(group[-1] + 1)[group]
-    both = np.array([1.0, -1.0])
-    contrast = both[: group[-1] + 1]
+    contrast = np.array([1.0, -1.0])[: group[-1] + 1]
 
     def draw(rng: np.random.Generator) -> int:
         v = rng.choice(variances, len(subjects))
