@@ -98,7 +98,7 @@ def read_module(path: Path, kinds: Mapping[str, type]) -> Any:
     try:
         return put_together(kind, static, members)
     except (HybridJaxError, TypeError, ValueError, IndexError, AttributeError) as error:
-        # (Whatever a constructor objects to; its text is for the user, and nothing reads it.)
+        # (Whatever a constructor objects to: its text is shown as it is.)
         reason = textwrap.shorten(str(error), 200)
         raise damaged(path, f"its content is no {kind.__name__} ({reason})") from error
 
@@ -364,8 +364,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
                 }
         except Exception as error:
             # (Whatever broken bytes make zipfile and numpy stumble over. A place outside of the
-            # file is EINVAL; what else the system reports is no damage. The text is for the user,
-            # and nothing reads it.)
+            # file is EINVAL; what else the system reports is no damage. The text is shown as it
+            # is.)
             if (
                 isinstance(error, MemoryError)
                 or getattr(error, "errno", EINVAL) != EINVAL
