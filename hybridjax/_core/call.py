@@ -43,17 +43,17 @@ def _frame_of_user() -> types.FrameType | None:
 
 
 @contextlib.contextmanager
-def public_call() -> Iterator[None]:
-    """A context of a call: a public call of its own, or a part of the one that is running if no
-    code of the user stands between them."""
+def public_call() -> Iterator[bool]:
+    """A context of a call, which says whether it is a public call of its own. It is a part of the
+    one that is running if no code of the user stands between them."""
     frame = _frame_of_user()
     call = _running.get()
     if call is not None and call.frame is frame:
-        yield
+        yield False
         return
     token = _running.set(_Call(frame, collections.OrderedDict()))
     try:
-        yield
+        yield True
     finally:
         _running.reset(token)
 

@@ -825,3 +825,26 @@ def test_a_flow_that_failed_does_not_end_at_an_event():
     rests = hj.flow(ball(), DROP, 5.0, throw=False)
     assert rests.result == Result.ZENO
     assert rests.findings == ()
+
+
+def _of_constants(height):
+    """A function of `height` that computes other things from constants alone."""
+    reference = hj.flow(ball(), DROP, 0.6)
+    start = hj.Guess("main", (height, 0.0))
+    return jnp.sum((hj.flow(ball(), start, 0.6).state - reference.state) ** 2)
+
+
+def _at_times(t):
+    """The height of a ball whose flow is a constant, at a time that is not."""
+    _, states = hj.flow(ball(), DROP, 0.6).at(t[None])
+    return states[0, 0]
+
+
+@pytest.mark.parametrize("function", [_of_constants, _at_times])
+def test_what_is_constant_in_a_program_has_values(function):
+    """What no traced number enters is computed while a program is traced, as it is outside."""
+    value, slope = jax.value_and_grad(function)(0.55)
+    programs = jax.jit(jax.value_and_grad(function))
+    assert_allclose(programs(0.55), (value, slope), rtol=1e-11)
+    both = jax.lax.map(function, jnp.array([0.55, 0.55]))
+    assert_allclose(both, value, rtol=1e-11)

@@ -10,9 +10,10 @@ from typing import Annotated, Any, NamedTuple, TypeVar, cast
 import equinox as eqx
 import jax
 
+from .. import jax_compat
 from ..call import public_call
 from ..exceptions import DefinitionError
-from ..executor import as_numpy, is_hidden
+from ..executor import as_numpy, is_hidden, is_inside_program, is_traced
 from ..memo import Memory
 from . import leads
 from .kinds import kind_of
@@ -120,9 +121,11 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     @functools.wraps(function)
     def call(*args, **kwargs):
         try:
-            with public_call(), as_numpy():
+            with public_call() as is_own, as_numpy():
                 if kinds.is_wrong(args, kwargs):
                     raise WrongArguments(kinds.about_wrong(name, args, kwargs))
+                if is_own and _is_constant(args, kwargs):
+                    return _constant(kinds, args, kwargs)
                 args, kwargs = kinds.take(args, kwargs)
                 return function(*args, **kwargs)
         except Misfit as misfit:
@@ -140,6 +143,28 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
     setattr(call, "kinds", kinds)  # noqa: B010
     setattr(call, "__signature__", ShortSignature(function, cls))  # noqa: B010
     return call
+
+
+def _is_constant(args: tuple, kwargs: dict[str, Any]) -> bool:
+    """Test whether JAX traces a program in which a call would be a constant: it traces none of the
+    arguments."""
+    if jax_compat.is_outside() or is_traced(args, kwargs):
+        return False
+    return is_inside_program()
+
+
+def _constant(kinds: "_Kinds", args: tuple, kwargs: dict[str, Any]) -> Any:
+    """The result of a call that is a constant of the program that JAX traces. It is computed now,
+    and not in the program, so that its values are known to all that asks for them."""
+    function = kinds.function
+    try:
+        with jax_compat.outside():
+            taken, by_name = kinds.take(args, dict(kwargs))
+            return function(*taken, **by_name)
+    except jax.errors.UnexpectedTracerError:
+        # (A function among the arguments reads a value that JAX traces.)
+        taken, by_name = kinds.take(args, kwargs)
+        return function(*taken, **by_name)
 
 
 class _Kinds:
