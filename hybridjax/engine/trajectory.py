@@ -29,7 +29,8 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system, evaluating
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
-from ..systems.system import Driven, Guess, HybridSystem
+from ..systems.system import Driven, Guess, HybridSystem, name_of
+from ..systems.transition import SAME_TIME, Scheduled
 from . import kernels
 from .cubic import interpolate
 from .events import INSTANT
@@ -225,7 +226,7 @@ class Trajectory(Showable, eqx.Module):
         begin = number(self.t[0])
         end = number(self.t[-1], unit=system.time_unit)
         text = folded(
-            f"Trajectory({type(system).__name__}: t = {begin} to {end}, {len(self.t) - 1} steps; "
+            f"Trajectory({name_of(system)}: t = {begin} to {end}, {len(self.t) - 1} steps; "
             f"{', '.join(events) or 'no events'}; ends in {s.names[self.chart[-1]]}: "
             f"{self.result.message})"
         )
@@ -389,8 +390,9 @@ def integrate(
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
     if new_input:
-        doubts = tuple(begins_beyond(s, begin, u, path.t[-1] - path.t[0]))
-        path = dataclasses.replace(path, findings=doubts)
+        guards = begins_beyond(s, begin, u, path.t[-1] - path.t[0])
+        schedules = begins_at_schedule(s, begin, u)
+        path = dataclasses.replace(path, findings=(*guards, *schedules))
     warn_of(path.findings)
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
@@ -476,7 +478,7 @@ def constant_input(system: HybridSystem, input: Any) -> Any:
         shape = value.shape
     if shape not in ((), (nu,)):
         raise DefinitionError(
-            f"the input has shape {shape}, but {type(system).__name__} has the inputs "
+            f"the input has shape {shape}, but {name_of(system)} has the inputs "
             f"({', '.join(names)}): give one number for each."
         )
     return namespace(value).broadcast_to(value, (nu,))
@@ -487,23 +489,62 @@ def begins_beyond(
 ) -> Iterator[Finding]:
     """Doubts about a start, of a flow that takes a time `span`, at which guards are beyond zero, or
     at zero and fall, or begin to."""
-    for g, value, is_due in guards_reached(s, begin, u, moment=_MOMENT * span):
-        transition = s.transitions[g]
+    for reached in guards_reached(s, begin, u, moment=_MOMENT * span):
+        transition = s.transitions[reached.transition]
         name = transition.name
-        if is_due:
+        if reached.rests:
+            text = (
+                f"the start is at rest on the guard of '{name}', and then goes beyond it: this "
+                "event does not happen there. What rests there, as a ball on the ground, needs a "
+                "chart of its own; what moves away from there needs a start after the reset."
+            )
+            yield Finding("on a guard", text)
+        elif reached.at_zero:
             text = (
                 f"the start lies on the guard of '{name}', and goes beyond it: this event does not "
                 "happen there. Start a little before it, or after its reset."
             )
             yield Finding("on a guard", text)
+        else:
+            value = transition.sign * reached.value
+            text = (
+                f"the start lies beyond the guard of '{name}' (its value is {value:.3g}; the event "
+                f"happens where it is {transition.direction} through zero), so that this event "
+                "cannot happen before the guard has come back."
+            )
+            yield Finding("beyond a guard", text)
+
+
+def begins_at_schedule(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
+    """Doubts about a start at the time of a scheduled event whose predicate holds."""
+    a = int(begin.chart[0])
+    t = begin.t
+    for g in s.schedules(a):
+        transition = s.transitions[g]
+        schedule = transition.guard
+        assert isinstance(schedule, Scheduled)
+        _, period = schedule.numbers(t)
+        away = np.abs(schedule.nearest(t) - t)
+        holds = kernels.enabled(s, s.member(g), t, begin.q[: s.dims[a]], u)
+        if away[0] > SAME_TIME * period or not holds.all():
             continue
         text = (
-            f"the start lies beyond the guard of '{name}' (its value is "
-            f"{transition.sign * value:.3g}; the event happens where it is "
-            f"{transition.direction} through zero), so that this event cannot happen before the "
-            "guard has come back."
+            f"the start lies at a time of the scheduled event '{transition.name}', which does not "
+            "happen there: it happens for the first time one period later. Start a little sooner, "
+            "or after its reset."
         )
-        yield Finding("beyond a guard", text)
+        yield Finding("at a scheduled event", text)
+
+
+class ReachedGuard(NamedTuple):
+    """A guard that has, or gets at once, the sign that it has after its event."""
+
+    transition: int
+    value: float
+    at_zero: bool
+    """Whether it is at zero, and not beyond it."""
+    rests: bool
+    """Whether it is at zero, and does not move there."""
 
 
 def guards_reached(
@@ -512,13 +553,9 @@ def guards_reached(
     u: np.ndarray,
     instant: float = 0.0,
     moment: float = 0.0,
-) -> Iterator[tuple[int, float, bool]]:
-    """The transitions of a lane whose guards are beyond zero, or fall to zero within an `instant`:
-    they have, or get at once, the sign that they have after their event. Also those at zero that
-    begin to fall within a `moment`, as the height of a ball that is at rest on the ground.
-
-    **Returns:** for each its index, the value of its guard, and whether it is at zero.
-    """
+) -> Iterator[ReachedGuard]:
+    """The guards of a lane that are beyond zero, or fall to zero within an `instant`, and those at
+    rest at zero that begin to fall within a `moment`, as the height of a ball on the ground."""
     a = int(lane.chart[0])
     guards = s.guards(a)
     n = s.dims[a]
@@ -538,12 +575,13 @@ def guards_reached(
         rate = slope @ flow
         noise_of_rate = _SAME * np.abs(slope * flow).sum()
         falls = rate < -noise_of_rate
+        rests = abs(rate) <= noise_of_rate
         if value < -noise:
-            yield g, value, False
+            yield ReachedGuard(g, value, at_zero=False, rests=False)
         elif falls and value <= noise - instant * rate:
-            yield g, value, True
-        elif begin and value <= noise:
-            yield g, value, True
+            yield ReachedGuard(g, value, at_zero=True, rests=False)
+        elif begin and rests and value <= noise:
+            yield ReachedGuard(g, value, at_zero=True, rests=True)
 
 
 def _along(

@@ -45,7 +45,7 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
-from ..systems.system import Driven, Guess, HybridSystem
+from ..systems.system import Driven, Guess, HybridSystem, name_of
 from ..systems.transition import SAME_TIME
 from . import rivals
 from .coincidence import all_commute, groups_on
@@ -168,7 +168,7 @@ class Flow(Showable, eqx.Module):
         return jnp.asarray(chart), jnp.asarray(states)
 
     def __repr__(self):
-        name = type(self.system).__name__
+        name = name_of(self.system)
         if is_traced(self.t) or np.ndim(self.t):
             shape = "traced" if is_traced(self.t) else f"of {len(self.t)} starts"
             failed = ""
@@ -216,7 +216,7 @@ def flow(
     input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
     settings: Settings | None = None,
     max_events: Count = 16,
-    max_steps: StepCount = MOST_STEPS,
+    max_steps: StepCount | None = None,
     throw: bool = True,
 ) -> Flow:
     """Integrate from any state, through any events, to a time, an event or a section.
@@ -241,7 +241,7 @@ def flow(
       `Flow`, its input.
     - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.
     - `max_events`: number of events of which times and states are kept. Default: 16.
-    - `max_steps`: largest number of steps, unless `settings` has a larger one. Default: 1024.
+    - `max_steps`: largest number of steps. Default: 1024, or that of `settings` if it is larger.
     - `throw`: raise an error if the flow ends early. Default: True. With False, and inside of JAX's
       transformations, `result` has the reason, and times and states are NaN.
 
@@ -289,7 +289,7 @@ def requested(
     input: Any,
     settings: Settings | None,
     max_events: int,
-    max_steps: int,
+    max_steps: int | None,
 ) -> _Request:
     """What is asked for.
 
@@ -299,9 +299,9 @@ def requested(
     settings = Settings() if settings is None else settings
     system = settings.system(system)
     settings = settings.filled(_ACCURACY)
-    # (Messages name the steps of the settings, which count, too, if they are more.)
-    most = max(max_steps, settings.max_steps)
-    settings = Settings(settings.rtol, settings.atol, most, settings.scale)
+    if max_steps is None:
+        max_steps = max(MOST_STEPS, settings.max_steps)
+    settings = Settings(settings.rtol, settings.atol, max_steps, settings.scale)
     check_system(system)
     check_symmetry(system)
     constant = constant_input(system, input)
@@ -692,7 +692,8 @@ def _ends_at_an_event(
 ) -> Iterator[Finding]:
     """A doubt about a flow to a time at which an event happens, too, but for rounding."""
     instant = SAME_TIME * span
-    found = [g for g, _, is_due in guards_reached(s, end, u, instant) if is_due]
+    reached = guards_reached(s, end, u, instant)
+    found = [x.transition for x in reached if x.at_zero]
     rows = np.flatnonzero(path.event >= 0)
     at_end = rows[path.t[-1] - path.t[rows] <= instant]
     found += path.event[at_end].tolist()
@@ -736,6 +737,9 @@ def _require_ends(found: Flow) -> None:
     message = Result(int(codes[k])).message
     if codes[k] == Result.SECTION_MISSED:
         message = _about_missed(found, k)
+    if codes[k] == Result.STEP_LIMIT:
+        most = found.request.settings.max_steps
+        message = f"{most} steps did not suffice; a larger `max_steps` may"
     if found.request.many:
         raise ComputationError(
             f"{len(failed)} of {len(codes)} flows did not reach their end, first start {k}: "

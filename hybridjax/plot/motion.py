@@ -29,7 +29,7 @@ from ..orbits.find import find_limit_cycle
 from ..sections.placed import PlacedSections
 from ..systems.quotient import Symmetric
 from ..systems.structure import Structure
-from ..systems.system import Guess
+from ..systems.system import Guess, name_of
 from .film import BODY, frames, gif, player
 from .look import COLORS, CYCLE, axis_of, close_in_notebook, style
 from .orbit import (
@@ -260,7 +260,7 @@ def _film(
             _unit_circle(figure.add_subplot(grid[1, 1]), multipliers)
         times = tracks[0].times - tracks[0].times[0]
         interval = (times[1] - times[0]) / pace
-        title = f"motion of {type(s.system).__name__}"
+        title = f"motion of {name_of(s.system)}"
         return Motion(figure, parts, times, interval, title)
 
 

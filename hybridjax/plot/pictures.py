@@ -14,6 +14,7 @@ from ..engine.trajectory import Trajectory
 from ..systems.check import evaluating
 from ..systems.drawing import Drawing
 from ..systems.structure import Structure
+from ..systems.system import name_of
 
 
 class Pictures:
@@ -127,7 +128,7 @@ def drawing_of(s: Structure, a: int) -> Any:
     def shapes():
         return jax.eval_shape(lambda t, q: s.drawing(a, t, q), time, state)
 
-    with evaluating(f"method `draw(self, chart, t, q)` of {type(s.system).__name__}"):
+    with evaluating(f"method `draw(self, chart, t, q)` of {name_of(s.system)}"):
         return s.once(("drawing", a), (), shapes)
 
 

@@ -23,6 +23,7 @@ from ..orbits.checks import check_periodic
 from ..systems.system import (
     HybridSystem,
     describe,
+    name_of,
     parameters_of,
     require_positive,
     unit_of_parameter,
@@ -177,7 +178,7 @@ class Family:
         if not isinstance(system, HybridSystem):
             raise DefinitionError(
                 "`model` must be a system, or a function of parameters that returns one, not a "
-                f"{type(system).__name__}."
+                f"{name_of(system)}."
             )
         require_x64(system)
         check_periodic(system)

@@ -25,7 +25,7 @@ from .structure import (
     quoted,
     require_inputs_apart,
 )
-from .system import HybridSystem, Output, arrays_of, require_positive
+from .system import HybridSystem, Output, arrays_of, name_of, require_positive
 from .transition import SAME_TIME, Scheduled, Transition
 
 
@@ -69,7 +69,7 @@ def _check_parameters(system: HybridSystem) -> None:
         values = np.asarray(leaf)
         if not np.isfinite(values).all():
             raise DefinitionError(
-                f"parameter `{name}` of {type(system).__name__} is {values}; every parameter must "
+                f"parameter `{name}` of {name_of(system)} is {values}; every parameter must "
                 "be finite."
             )
     require_positive(system)
@@ -94,7 +94,7 @@ def _check_functions(s: Structure) -> Iterator[str]:
 def _check_definition(s: Structure) -> None:
     """Check what the methods of a system return, and names of its inputs and of its solver."""
     system = s.system
-    kind = type(system).__name__
+    kind = name_of(system)
     charts = system.charts()
     if not isinstance(charts, Mapping) or not _are_all(charts.values(), Chart):
         raise DefinitionError(
@@ -140,7 +140,7 @@ def _check_chart(s: Structure, a: int) -> Iterator[str]:
 
 def _check_all_names(s: Structure) -> None:
     """Check that no two states, inputs, outputs or transitions have the same name."""
-    kind = type(s.system).__name__
+    kind = name_of(s.system)
     states = s.state_names()
     if len(set(map(str, states))) < len(states):
         raise DefinitionError(f"{kind} gives a state two units: {quoted(states)}.")

@@ -35,7 +35,7 @@ from .._core.signal import Signal, signals, unit_of
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart, Method, as_method
-from .system import Driven, HybridSystem, Output
+from .system import Driven, HybridSystem, Output, name_of
 from .transition import Scheduled, Transition
 from .verner import VERNER76
 
@@ -237,7 +237,7 @@ class Structure:
         names = self.inputs if names is None else names
         if not names:
             raise DefinitionError(
-                f"{type(self.system).__name__} has no inputs: without `inputs = ()` in its class "
+                f"{name_of(self.system)} has no inputs: without `inputs = ()` in its class "
                 "(or call) it has one, `u`, which its functions may ignore."
             )
         columns = np.array([_index("input", name, self.inputs) for name in names], int)
@@ -616,7 +616,7 @@ class Outputs:
                     f"the output '{name}' has the name of a state: ask for the state by its name "
                     f"alone, or give the output another one."
                 )
-        require_inputs_apart(type(structure.system).__name__, structure.inputs, made)
+        require_inputs_apart(name_of(structure.system), structure.inputs, made)
         self.names = tuple(
             states[o] if isinstance(o, str) else Signal(o.name, o.unit)
             for o in self.items

@@ -555,6 +555,13 @@ class Driven(Derived):
     drive: Callable[[Any], Any]
 
 
+def name_of(system: HybridSystem) -> str:
+    """The name of the class that the user wrote, also of a system that was made of it."""
+    while isinstance(system, Derived):
+        system = system.system
+    return type(system).__name__
+
+
 @parts_of.register
 def _(system: HybridSystem, t: Any, q: Any, u: Any) -> Iterator[Part]:
     charts = system.charts()

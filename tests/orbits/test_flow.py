@@ -730,10 +730,14 @@ def test_events_at_the_start_and_at_the_end():
     up = hj.Guess("main", (0.0, 1.0))
     thrown = hj.flow(ball(), up, 0.1)
     assert thrown.findings == ()
+    # The moment in which the rest of a guard is judged is longer than this throw.
+    long_after = hj.flow(ball(), up, 1e6, throw=False)
+    assert long_after.findings == ()
     rests = hj.Guess("main", (0.0, 0.0))
     for unit in (1.0, 1e-9):
         falls = hj.flow(ball(g=9.81 * unit), rests, 0.1)
         assert [x.cause for x in falls.findings] == ["on a guard"]
+        assert "needs a chart of its own" in falls.findings[0].text
     rises = hj.flow(ball(g=-9.81), rests, 0.1)
     assert rises.findings == ()
 
@@ -848,3 +852,69 @@ def test_what_is_constant_in_a_program_has_values(function):
     assert_allclose(programs(0.55), (value, slope), rtol=1e-11)
     both = jax.lax.map(function, jnp.array([0.55, 0.55]))
     assert_allclose(both, value, rtol=1e-11)
+
+
+class Sampled(hj.HybridSystem):
+    """A clock's time since its last tick."""
+
+    inputs = ()
+
+    def charts(self):
+        return {"on": Rising()}
+
+    def transitions(self):
+        def restart(t, q, u):
+            return 0.0 * q
+
+        every = hj.systems.Scheduled(1.0, offset=0.25)
+        return [hj.Transition("sample", "on", "on", guard=every, reset=restart)]
+
+
+class Rising(hj.Chart):
+    states = ("x",)
+
+    def field(self, t, q, u):
+        return (1.0 + 0.0 * q[0],)
+
+
+def test_a_start_at_the_time_of_a_scheduled_event():
+    """The event does not happen there, and a finding says so."""
+    at_time = hj.flow(Sampled(), hj.Guess("on", (0.0,), 1.25), 2.5)
+    assert [x.cause for x in at_time.findings] == ["at a scheduled event"]
+    assert at_time.count == 1
+    later = hj.flow(Sampled(), hj.Guess("on", (0.0,), 1.5), "sample", within=2.0)
+    assert later.findings == ()
+    goes_on = hj.flow(Sampled(), later, 2.5)
+    assert goes_on.findings == ()
+
+
+def test_the_limit_on_steps_is_the_one_that_is_given():
+    fall = ball()
+    with pytest.raises(ComputationError, match="3 steps did not suffice.*`max_steps`"):
+        hj.flow(fall, DROP, 1.0, max_steps=3)
+    large = hj.orbits.Settings(max_steps=5000)
+    assert hj.flow(fall, DROP, 1.0, settings=large).request.settings.max_steps == 5000
+
+
+class Air(hj.Chart):
+    states = ("x", "v")
+
+    def field(self, t, q, u):
+        return q[1], u[0]
+
+
+class Cart(hj.HybridSystem):
+    inputs = ("force",)
+
+    def charts(self):
+        return {"air": Air()}
+
+    def transitions(self):
+        return []
+
+
+def test_a_driven_system_prints_the_name_of_its_class():
+    start = hj.Guess("air", (0.0, 0.0))
+    moved = hj.flow(Cart(), start, 1.0, input=jnp.sin)
+    assert repr(moved).startswith("Flow(Cart: ")
+    assert repr(moved.trajectory).startswith("Trajectory(Cart: ")
