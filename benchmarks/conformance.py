@@ -396,7 +396,7 @@ def many(options) -> None:
     def gradient(starts, numbers):
         def loss(starts, numbers):
             found = hj.flow(
-                Dragged(*numbers), hj.Guess("air", starts), max_steps=256, **ten
+                Dragged(*numbers), hj.Guess("air", starts), max_steps=64, **ten
             )
             return jnp.sum(found.t**2 + found.state[:, 1] ** 2)
 

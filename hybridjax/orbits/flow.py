@@ -62,9 +62,18 @@ MOST_STEPS = 1024
 # which is relative to this duration. Larger: users are sent to `within` where a guard is touched.
 # Smaller: they are told of a touch where there is none.
 _MUCH_SHORTER = 1e-4
-# Bytes of the record of a flow's moves. More: gigabytes in reverse mode. Fewer: many flows are
-# computed in more parts, and reverse mode searches them again.
+# Most flows that are computed with all steps of the record at once, by a program that compiles
+# sooner. More: they run four times as long. Fewer: some wait for the compiler in vain.
+_FEW = 500
+# Most flows of a part. More: their states leave the cache of the processor. Fewer: the calls of
+# small functions of a program take longer than what these do.
+_AT_ONCE = 3000
+# Bytes of the record of a part's moves. More: gigabytes in reverse mode. Fewer: many flows are
+# computed in more parts.
 _RECORD = 64e6
+# Bytes of the record of all flows that reverse mode keeps. More: gigabytes. Fewer: parts are
+# searched twice.
+_MOST_RECORDED = 5e8
 # Rows of the record with which many flows begin. More: flows of few steps fill rows in vain. Fewer:
 # flows of many steps are computed twice, and another program is compiled.
 _ROWS = 128
@@ -441,31 +450,22 @@ def _only_chart(s: Structure, section: Crossing | None = None) -> int | None:
 
 
 def _flows(request: _Request) -> Flow:
-    """The flows of all lanes by one program, which gets many lanes part by part."""
-    parts = _parts(request)
-    if is_traced(request) or len(parts) == 1:
+    """The flows of all lanes by one program."""
+    if is_traced(request) or len(request.lanes.t) <= _FEW:
         return _result(request, _program(request), None)
-    passages = _one_by_one(request, parts)
-    joined = jax.tree_util.tree_map(lambda *x: jnp.concatenate(x, axis=-1), *passages)
-    L = len(request.lanes.t)
-    passage = jax.tree_util.tree_map(lambda x: x[..., :L], joined)
-    return _result(request, passage, None)
+    return _result(request, _with_enough_rows(request), None)
 
 
-def _one_by_one(
-    request: _Request, parts: Int[np.ndarray, "parts l"]
-) -> Iterator[Passage]:
-    """The passages of parts. The record has few rows as long as these suffice, because rows without
-    moves take time, too."""
+def _with_enough_rows(request: _Request) -> Passage:
+    """The passage of many lanes. The record has few rows as long as these suffice, because rows
+    without moves take time, too."""
     most = request.settings.max_steps
     rows = min(_ROWS, most)
-    for lanes in parts:
-        asked = _some(request, lanes)
-        passage = _MANY(_with_rows(asked, rows))
-        while rows < most and np.any(passage.moved.result == Result.STEP_LIMIT):
-            rows = min(4 * rows, most)
-            passage = _MANY(_with_rows(asked, rows))
-        yield passage
+    passage = _MANY(_with_rows(request, rows))
+    while rows < most and np.any(passage.moved.result == Result.STEP_LIMIT):
+        rows = min(4 * rows, most)
+        passage = _MANY(_with_rows(request, rows))
+    return passage
 
 
 def _with_rows(request: _Request, rows: int) -> _Request:
@@ -478,13 +478,19 @@ def _with_rows(request: _Request, rows: int) -> _Request:
 def _parts(request: _Request) -> Int[np.ndarray, "parts l"]:
     """The lanes of each part of a flow, such that its record is not too large. The last part is
     filled up with the last lane, so that all parts are of one size."""
-    lanes = request.lanes
-    L = len(lanes.t)
-    record = jax.eval_shape(lambda: blank_tape(request.settings.max_steps, lanes))
-    in_bytes = sum(x.size * x.dtype.itemsize for x in record)
-    count = max(1, min(L, int(np.ceil(in_bytes / _RECORD))))
+    L = len(request.lanes.t)
+    by_record = int(np.ceil(L * _bytes_of_record(request) / _RECORD))
+    by_cache = int(np.ceil(L / _AT_ONCE))
+    count = max(1, min(L, max(by_record, by_cache)))
     size = -(-L // count)
     return np.minimum(np.arange(count * size), L - 1).reshape(count, size)
+
+
+def _bytes_of_record(request: _Request) -> float:
+    """Bytes of the record of a flow's moves."""
+    lanes = request.lanes
+    record = jax.eval_shape(lambda: blank_tape(request.settings.max_steps, lanes))
+    return sum(x.size * x.dtype.itemsize for x in record) / len(lanes.t)
 
 
 def _some(request: _Request, lanes: Int[Array, " L"]) -> _Request:
@@ -535,16 +541,18 @@ _MANY = Program(_passage, loops=True)
 
 def _in_parts(request: _Request, times: Float[Array, " K"]) -> Passage:
     """The passage of all lanes, part by part if their record would be too large. Reverse mode keeps
-    where each part starts, and searches and records it again."""
+    the record, or if that is too large, where each part starts: it searches and records it again.
+    """
     parts = _parts(request)
     if len(parts) == 1:
         return _part(request, times)
 
-    @jax.checkpoint
     def part(lanes):
         return _part(_some(request, lanes), times)
 
     L = len(request.lanes.t)
+    if L * _bytes_of_record(request) > _MOST_RECORDED:
+        part = jax.checkpoint(part)
     passages = jax.lax.map(part, jnp.asarray(parts))
 
     def joined(x):

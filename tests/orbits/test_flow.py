@@ -490,6 +490,7 @@ def test_a_guard_that_is_touched():
 @pytest.mark.slow
 def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
     """The last part is filled up; reverse mode of a program searches the parts again."""
+    monkeypatch.setattr("hybridjax.orbits.flow._FEW", 10)
     monkeypatch.setattr("hybridjax.orbits.flow._RECORD", 4e5)
     height = np.linspace(0.5, 2.0, 14)
 
