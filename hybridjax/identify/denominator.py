@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
+from ..linear.multipliers import largest_first
 from .descent import ROUNDING, Coefficients
 
 
@@ -57,9 +58,7 @@ def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
     roots = np.roots([1.0, *coefficients]).astype(complex)
     at_zero = len(coefficients) - len(roots)  # numpy drops these
     roots = np.pad(roots, (0, at_zero))
-    by_modulus = -np.abs(roots)
-    order = np.lexsort((-np.imag(roots), by_modulus))
-    return roots[order]
+    return roots[largest_first(roots)]
 
 
 class Covariance(NamedTuple):

@@ -19,6 +19,7 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import folded, p_value, rounded, standard_error
 from ..errors import DefinitionError
+from ..linear.multipliers import largest_first
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients, positive
 from .fit import Fit
@@ -128,7 +129,7 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     rows, columns = linear_sum_assignment(distances)
     paired_values = values[rows]
     paired_truth = truth[columns]
-    order = np.lexsort((-np.imag(paired_truth), -np.abs(paired_truth)))
+    order = largest_first(paired_truth)
     # (Cycles and models have multipliers without errors.)
     with_fit = hasattr(true, "standard_errors")
     return MultiplierComparison(

@@ -18,6 +18,7 @@ from .._core.showable import WithMultipliers
 from .._core.text import how_many, number
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
+from ..linear.multipliers import largest_first
 from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Truth, compare_multipliers
 from .variable_projection import (
@@ -282,8 +283,7 @@ def _fit_one(
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
     """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
     finite = np.roots(coefficients).astype(complex)
-    order = np.lexsort((-np.imag(finite), -np.abs(finite)))
-    finite = finite[order]
+    finite = finite[largest_first(finite)]
     infinite = len(coefficients) - 1 - len(finite)
     return np.concatenate([np.full(infinite, np.nan), finite])
 

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ..errors import ComputationError
 
@@ -60,8 +60,13 @@ def product_eigenvalues(
         return np.zeros(0, complex)
     blocks = [_eigenvalues(block) for block in _diagonal_blocks(regular)]
     eigenvalues = np.concatenate(blocks)
-    order = np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))
-    return eigenvalues[order]
+    return eigenvalues[largest_first(eigenvalues)]
+
+
+def largest_first(values: Complex[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The indices that sort complex numbers by decreasing modulus; of a conjugate pair, the number
+    with positive imaginary part comes first."""
+    return np.lexsort((-np.imag(values), -np.abs(values)))
 
 
 def _balanced(factors):

@@ -31,6 +31,7 @@ from .._core.text import listed
 from ..errors import ComputationError, DefinitionError
 from ..identify.denominator import coefficients_of
 from ..identify.multiplier_estimate import MultiplierFit
+from ..linear.multipliers import largest_first
 from ..sections import families
 from .drive import At
 
@@ -640,9 +641,7 @@ def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
         twin = int(np.argmin(distance))
         differs[i] = differs[i] and differs[twin]
     rows = np.flatnonzero(differs)
-    chosen = found.value[rows]
-    order = np.lexsort((-chosen.imag, -np.abs(chosen)))
-    return rows[order]
+    return rows[largest_first(found.value[rows])]
 
 
 def _bound(
