@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.arguments import require_among, require_index
+from .._core.text import number
 from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
@@ -127,10 +128,9 @@ def wanted_parts(
             )
         powers = np.arange(d - 1, -1, -1)
         gradient = -(z**powers) / slope[k]
-        name = f"{z.real:.4g}"
+        name = number(z, 4)
         rows = [gradient.real]
         if z.imag != 0:
-            name += f"{z.imag:+.4g}j"
             rows.append(gradient.imag)
         if goal.part == "modulus":
             rows = [(z.conj() * gradient).real / abs(z)]

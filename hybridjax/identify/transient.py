@@ -18,7 +18,7 @@ from scipy import linalg, optimize
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
 from .._core.showable import Showable
-from .._core.text import folded
+from .._core.text import folded, number
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
@@ -50,9 +50,9 @@ class TransientFit(Showable, eqx.Module):
     removed: Float[np.ndarray, "S ny"]
 
     def __repr__(self) -> str:
-        shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
+        shown = ", ".join(number(z, 4) for z in self.multipliers)
         sizes = np.nanmax(self.removed, axis=0)
-        size = ", ".join(f"{x:.2g}" for x in sizes)
+        size = ", ".join(number(x, 2) for x in sizes)
         return folded(
             f"TransientFit(multipliers {shown}; removed rms up to {size}; {self.data!r})"
         )

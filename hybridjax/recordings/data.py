@@ -15,7 +15,7 @@ from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.showable import Showable
 from .._core.signal import unit_of, with_unit
-from .._core.text import folded, how_many
+from .._core.text import folded, how_many, number
 from ..experiments.data import ExperimentData
 from ..experiments.record import SectionSeries, uninterrupted_records
 
@@ -179,7 +179,7 @@ class SectionData(Showable, eqx.Module):
         for name, unit, x in zip(
             self.signals, self.units, np.concatenate(self.rms()), strict=True
         ):
-            sizes.append(f"{name} {x:.3g} {unit}".rstrip())
+            sizes.append(f"{name} {number(x, 3, unit)}")
         summary = (
             f"SectionData({self.cycles:.5g} cycles of "
             f"{how_many(self.n_sections, 'section', 'sections')} in "

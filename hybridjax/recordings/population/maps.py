@@ -27,7 +27,7 @@ from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Seed, Vector
 from ..._core.boundary.values import Complexes
 from ..._core.showable import Showable
-from ..._core.text import p_value
+from ..._core.text import number, p_value
 from .tables import Columns, require, rows_with, signed, table_of
 
 
@@ -104,10 +104,8 @@ class MapResult(Showable):
                 values = x[place]
                 spans.append(f"{name} {values.min():.3g} to {values.max():.3g}")
         where = ", ".join(spans) or "none"
-        largest_value = np.abs(self.values).max()
-        largest = f"{largest_value:.4g} {self.unit}".rstrip()
-        median = np.median(self.reach)
-        half_width = f"{median:.3g} {self.unit}".rstrip()
+        largest = number(np.abs(self.values).max(), 4, self.unit)
+        half_width = number(np.median(self.reach), 3, self.unit)
         return (
             f"MapResult({' x '.join(self.axes)}: largest {largest}\n"
             f"  median half-width of the 95 % band {half_width}\n"
