@@ -115,9 +115,11 @@ def rounded(x: Any, error: Any) -> str:
 
 
 def standard_error(error: Any) -> str:
-    """A standard error with two digits."""
-    if error == 0 or not np.isfinite(error):
-        return f"{error:g}"
+    """A standard error with two digits; `unknown` if the data do not determine the estimate."""
+    if not np.isfinite(error):
+        return "unknown"
+    if error == 0:
+        return "0"
     return _to_places(float(error), 1 - _exponent(error), most=_PLAIN_DECIMALS)
 
 
