@@ -27,6 +27,7 @@ from .guess import require_similar
 from .newton import FEW_STEPS
 from .return_map import ReturnMap, Turn
 from .rivals import coincide, events_on
+from .scale import in_sizes
 from .shooting import excess, newton_steps, one_by_one
 
 
@@ -226,7 +227,7 @@ class Tiles(NamedTuple):
         anchor, period, turn, codes, together = self._turn(rows, anchor, period)
         scale = np.asarray(self.map.settings.scale)
         sizes = scale[anchor.chart[:, 0]]
-        jacobian = turn.jacobian * sizes[:, None, :] / sizes[:, :, None]
+        jacobian = in_sizes(turn.jacobian, sizes)
         step = newton_steps(jacobian, turn.residual / sizes)
         q = anchor.q[..., 0] + step * sizes
         size = excess(q / sizes, step)

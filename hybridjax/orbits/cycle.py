@@ -55,7 +55,7 @@ from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
 from .linear_flow import hosted, last_turn, linear_flow, recorded_ends, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
-from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
+from .scale import ROUNDING, has_implicit, in_sizes, sizes_of, stiff_charts
 from .sensitivity import Sensitivity, sensitivity
 from .verdict import verdict
 
@@ -652,7 +652,8 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     for k, (size, basis) in enumerate(frames):
         size_after, basis_after = frames[(k + 1) % len(frames)]
         derivative = by[k, : len(size_after), : len(size)]
-        parts = basis_after.T, derivative * size / size_after[:, None], basis
+        scaled = in_sizes(derivative, size, size_after)
+        parts = basis_after.T, scaled, basis
         factor = np.linalg.multi_dot(parts)
         # (A zero that comes out as rounding would be a multiplier.)
         norms = [np.linalg.norm(x) for x in parts]

@@ -37,7 +37,7 @@ from .checks import check_claims
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap, Turn
-from .scale import Sizes, fastest, scale_of, sizes_near, slow_time
+from .scale import Sizes, fastest, in_sizes, scale_of, sizes_near, slow_time
 
 
 # An autonomous system is given up if it does not return within this multiple of the time scale of
@@ -420,7 +420,7 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     sizes = np.maximum(magnitude, scale)
     rate = field[:, 0] / sizes
     by_state = field[:, 2 : 2 + n]
-    jacobian = by_state * sizes / sizes[:, None]
+    jacobian = in_sizes(by_state, sizes)
     # (On a slow manifold rates are small, too, but the equilibrium is far away.)
     distance = np.linalg.lstsq(jacobian, rate)[0]
     if np.any(np.abs(distance) > _REST):

@@ -27,6 +27,7 @@ from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import CLOSED, SINGULAR, Return, ReturnMap, Turn, across
+from .scale import in_sizes
 from .shooting import (
     ATOL,
     RTOL,
@@ -158,7 +159,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     end = orbit.tangents(begin)[-1, 1:].T
     moved = np.where(map.valid, end, 0.0) / sizes
-    jacobian = turn.jacobian * sizes / sizes[:, None]
+    jacobian = in_sizes(turn.jacobian, sizes)
     each = np.tile(jacobian, (P, 1, 1))
     begin[1:] = (newton_steps(each, moved) * sizes).T
     tangents = orbit.tangents(begin)
@@ -311,7 +312,7 @@ def _step_from(
     """The turn from a state, in sizes, and the Newton step."""
     turn = map.turn_with_jacobian(x * map.sizes, travelled=travelled)
     sizes = map.sizes
-    jacobian = turn.jacobian * sizes / sizes[:, None]
+    jacobian = in_sizes(turn.jacobian, sizes)
     residual = turn.residual / sizes
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
@@ -363,9 +364,8 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
             least = size
             damping = damping / 3.5
             best = turn
-            jacobian = np.vstack(
-                [turn.jacobian * sizes / sizes[:, None], np.eye(len(x))]
-            )
+            scaled = in_sizes(turn.jacobian, sizes)
+            jacobian = np.vstack([scaled, np.eye(len(x))])
             error = np.append(residual, 0 * x)
         elif best is None:  # (no turn closes from here)
             break
@@ -438,9 +438,8 @@ def _root_jvp(primals, tangents):
         return map.turn(q, turn.record).residual
 
     _, by_parameters = eqx.filter_jvp(again, (map,), (t_map,))
-    jacobian = (
-        map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]
-    )
+    again_with_jacobian = map.turn_with_jacobian(q, record=turn.record)
+    jacobian = in_sizes(again_with_jacobian.jacobian, sizes)
     # (Solvers of lineax raise errors in reverse mode where derivatives are NaN.)
     step = jnp.linalg.pinv(jacobian, rtol=SINGULAR) @ (by_parameters / sizes)
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))

@@ -45,6 +45,7 @@ from ..systems.surfaces import SlidingChart
 from .crossing import to_section
 from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
+from .scale import in_sizes
 
 
 # Modes with multipliers below this modulus have no amplitude response. Smaller: rounding errors,
@@ -491,8 +492,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
     back = f[:, None] * along
     closed = monodromy - xp.eye(len(f)) + back
     if on_host(f):
-        scaled = closed * size / size[:, None]
-        smallest = svdvals(scaled)[-1]
+        smallest = svdvals(in_sizes(closed, size))[-1]
         if map.conserved or not smallest > SINGULAR:
             raise ComputationError(
                 "the cycle has no defined phase: its multiplier 1 is double, as in a family of "
@@ -507,7 +507,7 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
     **Raises:** `ComputationError` for multipliers that coincide.
     """
     xp = namespace(M)
-    scaled = M * size / size[:, None]
+    scaled = in_sizes(M, size)
     values, right = xp.linalg.eig(stop_gradient(scaled))
     lower_last = 1e-9 * (xp.imag(values) < 0)
     order = xp.argsort(-xp.abs(values) + lower_last, stable=True)

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.arguments import require_among
-from .._core.executor import is_tracer, to_host
+from .._core.executor import Array, is_tracer, to_host
 from .._core.precision import real
 from ..engine import kernels
 from ..engine.lanes import Lanes
@@ -106,6 +106,20 @@ def sizes_on(s: Structure, lanes: Lanes, period: float) -> Sizes:
     floor = _TIMES_ROUNDING * period * rounding
     size = np.maximum(np.abs(q), floor)
     return _by_name(s, chart, size)
+
+
+def in_sizes(
+    matrix: Float[Array, "*L n d"],
+    sizes: Float[Array, "*L d"],
+    after: Float[Array, "*L n"] | None = None,
+) -> Float[Array, "*L n d"]:
+    """A derivative of states by states, without units: both in units of their sizes.
+
+    **Arguments:** `sizes` of the states by which the derivative is taken; `after`, sizes of the
+    states whose derivative it is. Default: the same.
+    """
+    rows = sizes if after is None else after
+    return matrix * sizes[..., None, :] / rows[..., :, None]
 
 
 def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:

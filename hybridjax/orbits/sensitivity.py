@@ -26,6 +26,7 @@ from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
 from .return_map import SINGULAR, ReturnMap, with_derivatives
+from .scale import in_sizes
 
 
 @checked_methods
@@ -97,10 +98,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     longer = -(Z @ total[:, 0])
     if clocked:
         longer = map.multiplicity * kernels.by_parameter_of_period(varied)
-        if (
-            on_host(whole)
-            and svdvals(closed * map.sizes / map.sizes[:, None])[-1] < SINGULAR
-        ):
+        if on_host(whole) and svdvals(in_sizes(closed, map.sizes))[-1] < SINGULAR:
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."

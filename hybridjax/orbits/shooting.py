@@ -28,7 +28,7 @@ from ..engine.search.attempt import deviation
 from ..engine.search.state import Stride
 from ..engine.target import Target, until
 from .return_map import CLOSED, PIECES, SINGULAR, Return, ReturnMap
-from .scale import has_implicit
+from .scale import has_implicit, in_sizes
 
 
 # Newton's method ends with a step below this, in sizes of the states and relative to the state.
@@ -153,8 +153,8 @@ def _step_of(
     by_start = np.where(valid, end[:, :-1], 0.0)
     residual = returned - q - off
     jacobian = by_start - np.eye(len(x)) - held
-    in_sizes = jacobian * sizes / sizes[:, None]
-    (step,) = newton_steps(in_sizes[None], (residual / sizes)[None])
+    scaled = in_sizes(jacobian, sizes)
+    (step,) = newton_steps(scaled[None], (residual / sizes)[None])
     return step
 
 
