@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..public import about_word, is_namespace, place_of
-from ..spelling import spelled_alike
+from ..spelling import same_word, spelled_alike
 from . import words
 from .guesses.attributes import ATTRIBUTES
 from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
@@ -59,7 +59,7 @@ def _leads_of_name(
 
     own = "" if namespace == "hybridjax" else namespace
     yield words.lead_of(NAMES, [own], name)
-    yield place(words.same_word(name, places))
+    yield place(same_word(name, places))
     yield words.lead_of(NAMES, [""], name)
     yield place(spelled_alike(name, places))
     yield words.lead_of_library([""], name)
@@ -328,7 +328,7 @@ def _synonym(name: str, among: Collection[str]) -> str | None:
     for word in words.synonyms(name):
         if word in among:
             return word
-    return words.same_word(name, among)
+    return same_word(name, among)
 
 
 def about_object(
