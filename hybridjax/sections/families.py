@@ -123,9 +123,13 @@ class _Anchored(AbstractSections):
         return at_crossing if isinstance(self.anchor, Crossing) else self.anchor * unit
 
     def describe(self, i: int) -> str:
+        return self._describe(i, self.label)
+
+    def _describe(self, i: int, kind: str) -> str:
+        """The name of section i, with its distance from section 0 in a kind of phase."""
         if i == 0:
             return "section 0"
-        return f"section {i} ({self.label} phase {i}/{self.n_sections} after section 0)"
+        return f"section {i} ({kind} phase {i}/{self.n_sections} after section 0)"
 
 
 def _as_anchor(x: Crossing | Scalar) -> Crossing | Array:
@@ -165,9 +169,7 @@ class ClockPhase(_Anchored):
         return BoundSections.at_times(first + steps)
 
     def describe(self, i: int) -> str:
-        if i == 0:
-            return "section 0"
-        return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
+        return self._describe(i, "clock")
 
 
 @checked
