@@ -243,9 +243,9 @@ def _fit_one(
     rms = float(np.sqrt(power))
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
-    exponents = 1 + np.arange(zeros + 1)
-    angles = -2j * np.pi * f[:, None] * exponents
-    powers = np.exp(angles)
+    delays = 1 + np.arange(zeros + 1)
+    exponent = -2j * np.pi * f[:, None] * delays
+    powers = np.exp(exponent)
     response = FittedResponse(
         harmonic=(0, -1),
         share=1.0,

@@ -317,10 +317,10 @@ class Design(Showable, eqx.Module):
         rng = np.random.default_rng(seed)
         pair = self.line * len(self.inputs) + self.channel
         pairs, place = np.unique(pair, return_inverse=True)
-        turns = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
+        angles = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
         real = is_real(pairs // len(self.inputs), self.periods, self.n_sections)
-        turns = np.where(real, np.pi * (turns > np.pi), turns)
-        phase = (self.phase + turns[:, place]) % (2 * np.pi)
+        angles = np.where(real, np.pi * (angles > np.pi), angles)
+        phase = (self.phase + angles[:, place]) % (2 * np.pi)
         shift = np.arange(count)[:, None] * self.experiments
         return self._times(count, phase, self.experiment + shift)
 
