@@ -25,6 +25,7 @@ from ..systems.structure import Outputs, Structure
 from ..systems.system import Output, OutputNames
 from .linear_flow import LinearFlow, linear_flow, rule
 from .return_map import ReturnMap
+from .scale import in_sizes
 
 
 # Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
@@ -183,7 +184,7 @@ def _transfer(
     # The deviation at phase 0 is that one period later.
     size = map.sizes
     column = size[:, None]
-    scaled = whole * size / column
+    scaled = in_sizes(whole, size)
     back_a_period = xp.exp(-2j * np.pi * f)[:, None, None]
     turned = xp.eye(d) - back_a_period * scaled
     right = end[..., :nu] / column
@@ -201,9 +202,9 @@ def _require_no_pole(
     monodromy: Float[np.ndarray, "d d"],
 ) -> None:
     """**Raises:** `DefinitionError` for a frequency at which the HTF is infinite."""
-    turns = np.exp(2j * np.pi * f)
+    phasors = np.exp(2j * np.pi * f)
     multipliers = np.linalg.eigvals(monodromy)
-    apart = np.abs(turns[:, None] - multipliers).min(axis=1)
+    apart = np.abs(phasors[:, None] - multipliers).min(axis=1)
     if (apart < _POLE).any():
         where = "every whole number" if map.base else "its multipliers of modulus 1"
         raise DefinitionError(
