@@ -256,8 +256,8 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
             continue
         angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))
         spectra = np.zeros((_REDRAWS, len(size)), complex)
-        turns = np.exp(1j * angle)
-        spectra[:, lines] = size[lines] * turns
+        phasors = np.exp(1j * angle)
+        spectra[:, lines] = size[lines] * phasors
         waves = np.fft.irfft(spectra, len(signal), axis=1)
         draws = np.abs(waves).max(axis=1)
         tested += 1
@@ -275,8 +275,9 @@ def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
         x = getattr(a, name)
         y = getattr(b, name)
         if isinstance(x, tuple):
-            total = x[0] + y[0]
-            both[name] = (total, x[1] + y[1])
+            first = x[0] + y[0]
+            second = x[1] + y[1]
+            both[name] = (first, second)
             continue
         shape = (len(line), *x.shape[1:])
         both[name] = np.zeros(shape, x.dtype)

@@ -365,5 +365,6 @@ def about_begin(map: ReturnMap, g: int) -> str:
 def _at_anchor(map: ReturnMap):
     """The guards (G,) at the anchor, and their rates."""
     watched = map.watch(map.anchor, until(map.anchor.t))
-    value = watched.value[:-1, 0]
-    return value, watched.rate[:-1, 0]
+    guards = watched.value[:-1, 0]
+    rates = watched.rate[:-1, 0]
+    return guards, rates

@@ -31,7 +31,7 @@ from .crossing import Crossing, ListLevels
 from .periodic import has_period
 from .return_map import CLOSED, SINGULAR, ReturnMap, across
 from .rivals import coincide_on
-from .scale import ROUNDING, has_implicit
+from .scale import ROUNDING, has_implicit, in_sizes
 from .shooting import ATOL, RTOL
 
 
@@ -300,8 +300,7 @@ def _newton(map: ReturnMap, factors, residual, q):
     unit = jnp.eye(len(q))
     jacobian = product - unit - map.held(q)[1]
     sizes = map.sizes
-    scaled = jacobian * sizes / sizes[:, None]
-    step = -solve_by_columns(scaled, residual / sizes)
+    step = -solve_by_columns(in_sizes(jacobian, sizes), residual / sizes)
     tolerance = ATOL + RTOL * jnp.abs(q / sizes)
     excess = jnp.max(jnp.abs(step) / tolerance)
     distance = jnp.max(jnp.abs(residual) / sizes)
@@ -355,19 +354,26 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     def zeros(*shape):
         return jnp.zeros((*lanes, *shape))
 
-    factors = zeros(K, d, d)
-    pieces = zeros(K), zeros(K, d), zeros(K, d), factors
-    inside = jnp.zeros(lanes, bool)
-    passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
-    unsolved = zeros() + jnp.inf
-    turns = jnp.zeros(lanes, int)
+    passage = Passage(
+        t=zeros(),
+        q=q,
+        ends=ends,
+        pieces_t=zeros(K),
+        pieces_q=zeros(K, d),
+        rates=zeros(K, d),
+        factors=zeros(K, d, d),
+        delay=zeros(d),
+        error=zeros(),
+        last=zeros(),
+        left=jnp.zeros(lanes, bool),
+    )
     return Corrected(
         q=q,
         passage=passage,
         jacobian=zeros(d, d),
         distance=zeros(),
-        excess=unsolved,
-        turns=turns,
+        excess=jnp.full(lanes, jnp.inf),
+        turns=jnp.zeros(lanes, int),
     )
 
 
@@ -548,7 +554,7 @@ def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
     xp = namespace(found.q)
     # (On a cycle that is not isolated, Newton's method ends anywhere.)
     sizes = route.map.sizes
-    defect = found.jacobian * sizes / sizes[:, None]
+    defect = in_sizes(found.jacobian, sizes)
     isolated = xp.min(svdvals(defect), axis=-1) >= SINGULAR
     if route.map.base is None:
         # (The last event of a turn that ends with one may come later than the turn ends.)

@@ -323,7 +323,8 @@ class ReturnMap:
             level = np.sqrt(variance)
             levels.append(np.maximum(level, rounding))
         narrowest = levels[0]
-        return narrowest, np.max(levels, axis=0)
+        largest = np.max(levels, axis=0)
+        return narrowest, largest
 
     def slopes(self) -> Float[np.ndarray, "d d"]:
         """Return central differences of second order with the smallest steps."""
