@@ -5,6 +5,10 @@ with the saltation matrix S, and Z . f = 1. The response I of the amplitude of a
 multiplier exp(kappa T) satisfies dI/dt = -(Df - kappa)^T I with the same jumps, and I . v = 1 for
 the mode v (G. B. Ermentrout, D. H. Terman, Mathematical foundations of neuroscience, Springer 2010,
 Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
+
+`LimitCycle.responses` calls `responses`, which gets Z and I at the nodes of the `LinearFlow` of the
+cycle (`linear_flow.py`) and returns a `Responses`. `loop` gives Z at phase 0, and `_modes` the
+multipliers and modes. A *push* is a brief input or a jump of a state.
 """
 
 import functools as ft
@@ -79,13 +83,13 @@ class PhaseCurve(Showable, eqx.Module):
 
 
 class Impulse(NamedTuple):
-    """The response to an input that acts at an event, through its guard or reset: there, the input
-    changes the phase or the amplitude by `weight` times its value."""
+    """The response to an input that acts at an event, through a guard or a reset: the value of the
+    input at the event, times `weight`, changes the phase or the amplitude."""
 
     event: str
     phase: Float[Array, ""]
     weight: dict[str, Inexact[Array, ""]]
-    """By name of the input."""
+    """Change per unit of each input, by name of the input."""
 
 
 class Locked(NamedTuple):
@@ -120,8 +124,8 @@ class Coupling(Showable, eqx.Module):
 
     @property
     def locking(self) -> tuple[float, float]:
-        """The least and the largest frequency of a push that the cycle follows, less that of the
-        cycle, per strength of the push: the Arnold tongue, to first order."""
+        """The Arnold tongue, to first order: least and largest difference between the frequency of
+        a push that entrains the cycle and the frequency of the cycle, per strength of the push."""
         values = self([x.lead for x in self._slope._zeros()] or [0.0])
         return float(values.min()), float(values.max())
 
@@ -141,7 +145,7 @@ class Coupling(Showable, eqx.Module):
         return Coupling(rates * c)
 
     def _zeros(self) -> tuple[Locked, ...]:
-        """Zeros in one cycle, with the slopes there."""
+        """Zeros in one cycle, with their slopes."""
         from scipy import optimize  # (a third of a second)
 
         steps = 16 * len(self.coefficients)
@@ -164,7 +168,7 @@ class Coupling(Showable, eqx.Module):
         return tuple(locked)
 
 
-# When responses were made, for messages.
+# How messages call the time at which responses were computed.
 _MADE = "these responses were computed"
 
 
@@ -198,7 +202,8 @@ class Responses(Showable, eqx.Module):
     """The phase response in time; `None` if clocked."""
     of_amplitudes: Inexact[Array, "r P K d"]
     surface: Float[Array, "P K d d"]
-    """The effect of a push, less what sliding undoes."""
+    """Derivative of the state after a push by the push: a part of it is lost where the state slides
+    on a surface."""
 
     def phase(
         self, phase: Phases, unit: Unit = "time"
@@ -478,10 +483,10 @@ def asymptotic_phase(
 
 
 def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
-    """M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple, and the phase
-    response at the beginning; M - I and zeros for a clock.
+    """The matrix M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple; and
+    the phase response at the beginning. In a clocked system: M - I, and zeros.
 
-    **Raises:** `ComputationError` if it is not simple.
+    **Raises:** `ComputationError` if the multiplier 1 is not simple.
     """
     xp = namespace(f)
     size = map.sizes
@@ -527,10 +532,10 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
 
 
 def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
-    """An eigenvalue of M with its right and left eigenvectors, in units of the states, near an
-    approximation, by one Newton step, which also carries derivatives.
+    """An eigenvalue of M with its right and left eigenvectors, in units of the states. One Newton
+    step from an approximation also gives them derivatives.
 
-    **Raises:** `ComputationError` for one that coincides with another.
+    **Raises:** `ComputationError` for an eigenvalue that coincides with another one.
     """
     xp = namespace(M)
     n = len(M)

@@ -3,6 +3,9 @@
 A parameter is an input of frequency 0. The change of the shape at equal phases is the infinitesimal
 shape response curve, and the changes of the times between events are local timing responses (Y.
 Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
+
+`LimitCycle.sensitivity` calls `sensitivity`. `_sensitivity` drives the linear flow of the cycle
+(`linear_flow.py`) with a constant input, and closes it over one period (`responses.loop`).
 """
 
 from typing import Any
@@ -54,7 +57,7 @@ class Sensitivity(Showable, eqx.Module):
     change: Float[Array, "P K d"]
 
     def shape(self, phase: Phases) -> dict[str, Float[Array, " p"]]:
-        """Derivatives of the states at equal phases, by name; NaN in charts that lack one."""
+        """Derivatives of the states at equal phases, by name; NaN in charts that lack the state."""
         require_as_made(self.structure.system, "these derivatives were computed")
         chart, states = self.flow.at(phase, self.duration, self.change)
         return by_name(self.structure, chart, states)
@@ -132,8 +135,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
 def section_delay(
     map: ReturnMap, f: Float[Array, " d"], parameter: str | None = None
 ) -> tuple[Float[Array, " d"], Array]:
-    """The time by which a changed state at phase 0 comes later to the section, per change of the
-    state and of the first input."""
+    """Derivatives of the time of arrival at the section, by the state at phase 0 and by the first
+    input."""
     assert map.base is not None
     levels = ListLevels((map.base,))
     index = np.zeros(1, np.int32)
