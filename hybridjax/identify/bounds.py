@@ -1,4 +1,10 @@
-"""The smallest standard errors that an experiment allows, before it is made."""
+"""`cramer_rao`: the smallest standard errors of multipliers that an experiment allows, before it is
+made.
+
+It takes the exact model and HTFs with the variances that they will have, and returns a
+`MultiplierEstimate`. With the matrices as unknowns (`fit_ldtp`), `_with_matrices` computes the
+bound; otherwise it is that of `fit_multipliers`.
+"""
 
 import dataclasses
 from typing import Literal

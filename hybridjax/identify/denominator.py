@@ -2,8 +2,11 @@ r"""The denominator $\chi$ that all transfer functions of a periodic system shar
 
 $$\chi(q^{-N}) = 1 + c_1 q^{-N} + \ldots + c_d q^{-dN} = \prod_i (1 - \lambda_i q^{-N})$$
 
-Its coefficients c are real, its roots are the d non-zero Floquet multipliers. The covariances of
-estimated coefficients hold whatever the errors are.
+Its coefficients c are real, and its roots are the d non-zero Floquet multipliers. All fits with
+this denominator call this file: `multipliers_of` and `coefficients_of` convert, `sandwich` and
+`block_freedom` give the covariance of estimated coefficients and its degrees of freedom, whatever
+the distribution of the errors is. A wrong error bar has its cause in `sandwich`, or in the scores
+that it gets.
 """
 
 from typing import NamedTuple
@@ -15,14 +18,16 @@ from ..linear.multipliers import largest_first
 from .descent import ROUNDING, Coefficients
 
 
-# Part of a response that is left when it counts as forgotten (the number of cycles whose scores
-# are correlated). Smaller: more lags, and covariances that scatter more; larger: they miss more.
+# A response counts as forgotten when this part of it is left. (Scores of cycles are correlated
+# until then.) Smaller: more lags, and covariances that scatter more. Larger: covariances miss a
+# part.
 _FORGOTTEN = 0.1
-# Largest modulus of a multiplier that is assumed before a fit: 0.99 takes 230 cycles. Larger:
-# simulations from starts overflow; smaller: slow modes start far from their minimum.
+# Largest modulus of a multiplier at the start of a fit (with 0.99, a tenth is left after 230
+# cycles). Larger: simulations overflow. Smaller: slow modes start far from their minimum.
 SLOWEST = 0.99
-# Smallest share of its errors that a fit leaves to a block or line. Smaller: blocks that alone
-# determine a coefficient dominate the covariance; larger: covariances are too small.
+# A fit reduces the residuals of a block or line, which is corrected for; at least this share is
+# assumed to be left. Smaller: blocks that alone determine a coefficient dominate the covariance.
+# Larger: covariances are too small.
 _SMALLEST_REMAINDER = 0.1
 
 
@@ -54,7 +59,7 @@ def coefficients_of(multipliers: Complex[np.ndarray, " d"]) -> Float[np.ndarray,
 
 
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
-    """Return the multipliers by decreasing modulus, of each pair the upper one first."""
+    """Return the multipliers by decreasing modulus, of each conjugate pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)
     at_zero = len(coefficients) - len(roots)  # numpy drops these
     roots = np.pad(roots, (0, at_zero))
@@ -62,7 +67,7 @@ def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
 
 
 class Covariance(NamedTuple):
-    """A covariance matrix, infinite where nothing is known, and how well it is known."""
+    """A covariance matrix, which is infinite where nothing is known, and its degrees of freedom."""
 
     matrix: Float[np.ndarray, "d d"]
     dof: float
@@ -100,7 +105,7 @@ def sandwich(
 def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> int:
     """Return the cycles after which a tenth of the slowest response is left.
 
-    At most a quarter of a record.
+    The result is at most a quarter of `cycles`.
     """
     slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
     # (Sums over fewer pairs scatter more.)
@@ -129,7 +134,8 @@ def in_blocks(
 def inverse_of_remainder(
     taken: Float[np.ndarray, "B k k"], power: float = 1.0
 ) -> Float[np.ndarray, "B k k"]:
-    """Return (1 - taken)^-power, `taken` being the share of a block's errors that a fit takes."""
+    """Return (1 - taken)^-power, where `taken` is the share by which a fit reduces the errors of a
+    block."""
     remainder = np.eye(taken.shape[1]) - taken
     values, vectors = np.linalg.eigh(remainder)
     values = np.maximum(values, _SMALLEST_REMAINDER)

@@ -1,7 +1,9 @@
-"""Sums over experiments, for each line of the spectrum, from which HTFs are estimated.
+"""Sums over experiments, for each line of the spectrum, from which `estimate_htf` estimates HTFs.
 
-Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. The sums take the
-same memory for any number of experiments, and those of two sets of experiments add.
+Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. `spectral_sums`
+returns `SpectralSums`; experiments may come in parts, since the sums of two parts can be added
+(`_add`), so that memory does not depend on their number. Lines are selected in `_excited`, and
+spectra of outputs are computed in `_outputs`: look there if an estimate lacks lines or is shifted.
 """
 
 from collections.abc import Iterable, Iterator
@@ -26,15 +28,16 @@ Experiments = (
 """Experiments, or parts of them one after the other."""
 
 
-# Largest change of a line of the input from one window to the next, relative to the largest line.
-# Smaller: recorded inputs with noise are refused; larger: inputs of another period pass.
+# The input repeats if each of its lines changes from window to window by less than this, relative
+# to the largest line. Smaller: recorded inputs with noise are refused. Larger: inputs of another
+# period pass.
 _REPEATS = 1e-2
-# Part of the largest line of an input below which a line is not excited, where nobody chose it.
-# Smaller: rounding counts as a line; larger: weak lines are missed.
+# By default, a line of an input is excited if it exceeds this part of the largest line. Smaller:
+# rounding errors count as lines. Larger: weak lines are missed.
 SILENT_LINE = 1e-6
-# Signals whose crest factors are tested, at most, redraws of the phases of each, and its fewest
-# lines. Fewer signals or redraws: random phases count as optimized more often, by chance; fewer
-# lines: chance does as well as any choice of phases.
+# Largest number of signals whose crest factors are tested; number of redraws of the phases of each;
+# and least number of lines of a signal. Fewer signals or redraws: random phases count as optimized
+# more often, by chance. Fewer lines: random phases may be as good as optimized ones.
 _TESTED = 12
 _REDRAWS = 200
 _FEWEST_LINES = 8
@@ -88,9 +91,9 @@ class SpectralSums(NamedTuple):
     present: Float[np.ndarray, "K nu"]
     """The number of experiments with each input."""
     energies: Float[np.ndarray, "K nu M ny"]
-    """Sums of |Y[k + l P]|^2 over the experiments with each input."""
+    """Sums of |Y[k + l P]|^2 over the experiments that excite each input."""
     turned: Complex[np.ndarray, "K nu M ny"]
-    """Sums of Y[k + l P]^2, turned back by twice the phase of each input."""
+    """Sums of Y[k + l P]^2, with twice the phase of each input subtracted from its phase."""
     noise: Float[np.ndarray, "K M ny"]
     """Sums of the variance of Y[k + l P] between windows; zero for one window."""
     crest_factors: tuple[int, int]
@@ -105,7 +108,7 @@ class SpectralSums(NamedTuple):
         return self.line / self.setup.periods
 
     def solvable(self) -> Bool[np.ndarray, " K"]:
-        """Test which lines tell the responses to all inputs (and mirror images) apart."""
+        """Test at which lines the responses to all inputs (and mirror images) can be separated."""
         nu = len(self.setup.inputs)
         single = regular(self.gram[:, :nu, :nu])
         return np.where(self.mirrored, single & regular(self.gram), single)
@@ -209,7 +212,8 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
 
 
 def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):
-    """Return experiment, line and U of every excited line, checked that they do not meet."""
+    """Return experiment, line and U of every excited line. Raises an error if lines of an
+    experiment disturb each other."""
     known = np.isfinite(data.u).all(axis=(1, 2), keepdims=True)
     u = np.where(known, data.u, 0.0)
     in_windows = [np.fft.rfft(u[:, window], axis=1) for window in windows]

@@ -284,7 +284,7 @@ class ReturnMap:
             try:
                 moved_return = self(self.x + move)
                 change = np.abs(moved_return - first - move)
-            except ComputationError:  # (if the plant falls, something depends on the coordinate)
+            except ComputationError:  # (the plant falls: something depends on it)
                 continue
             travels[k] = bool((change <= tolerance).all())
         turns = steady & (np.abs(advance) > self.size / 2)
