@@ -1,4 +1,9 @@
-"""Data at the sections of a recorded cycle."""
+"""`SectionData`: inputs and outputs of a recording at the sections of its cycle, as deviations from
+the average cycle.
+
+`sample_sections` (`sampling.py`) makes it, and all estimates from recordings take it. Its `records`
+have the form that fits to time series use.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,11 +25,12 @@ from ..experiments.data import ExperimentData
 from ..experiments.record import SectionSeries, uninterrupted_records
 
 
-# Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
-# where transfer functions are still identified. Smaller: rounding counts as power.
+# An input has power at a frequency if its power there exceeds this part of its largest power.
+# Larger: bands end where transfer functions could still be identified. Smaller: rounding errors
+# count as power.
 LEAST_POWER = 0.01
-# Fraction of the Nyquist frequency up to which an input must have power to count as broadband.
-# Larger: every band has an edge. Smaller: responses contain frequencies that were not excited.
+# An input is broadband if it has power up to this part of the Nyquist frequency. Larger: every band
+# has an edge. Smaller: responses contain frequencies that were not excited.
 WHOLE_BAND = 0.9
 
 

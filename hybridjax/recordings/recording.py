@@ -1,4 +1,10 @@
-"""What a laboratory recorded: sampled signals, events, units, in one or several trials."""
+"""`Recording`: what a laboratory recorded, that is, sampled signals and events with units, in one
+or several trials.
+
+Nothing is resampled or filled in: a missing sample is NaN. The constructor checks the arrays;
+`join` and `beside` combine recordings, and `mark` adds events. Errors about times come from
+`_require_increasing`.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -46,7 +52,7 @@ class Trial(eqx.Module):
     name: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        # (JAX makes trees with other leaves of it.)
+        # (JAX may make a `Trial` whose leaves are not arrays.)
         is_series = isinstance(self.time, np.ndarray) and len(self.time) > 1
         return f"Trial({_summary(self).strip() if is_series else self.name})"
 
@@ -411,7 +417,7 @@ def _require_increasing(where: str, time: Series) -> None:
     if not after < before:
         remedy = "leave out such samples"
     elif _begins_again(time, bad):
-        # From the last sample before the fall to the first after it, a step passes.
+        # (One step passes from the last sample before the fall to the first sample after it.)
         period = before - after + float(np.nanmedian(np.diff(finite)))
         remedy = (
             "if the clock wraps, undo it (`numpy.unwrap` with "

@@ -1,4 +1,9 @@
-"""Trials that differ from the others in units, columns, clocks or cycles, and slow changes."""
+"""Checks that compare trials: units, columns, clocks, cycles; and slow changes.
+
+`inspect.py` calls the functions without underscore; each yields findings. Most of them compare a
+number of one trial (range, period, correlation of average cycles) with the median of the other
+trials. The constants are their limits.
+"""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -20,19 +25,22 @@ from ..smoothing import Series
 # Factor within which ranges of two signals are alike, and a ratio is a power of ten. Larger: other
 # gains are taken for units. Smaller: swapped columns of signals whose range varies pass.
 _ALIKE = 1.2
-# Least offset of another zero in offsets of the other trials, which is also the least fraction of a
-# range. Larger: offsets pass. Smaller: scatter between trials is reported.
+# A trial has another zero if its offset exceeds this multiple of the offsets of other trials, and a
+# part of the range. Larger: offsets pass. Smaller: scatter between trials is reported.
 _OFF = 10.0
-# Least correlation of average cycles that are alike, each of so many values. Larger: noisy cycles
-# differ. Smaller: other events and swapped signals pass.
+# Average cycles (of a number of values each) are alike if their correlation exceeds this. Larger:
+# noisy cycles differ. Smaller: other events and swapped signals pass.
 _CORRELATED = 0.8
 _PHASES = HARMONICS // 2
-# Relative difference of periods of trials. Larger: other speeds pass. Smaller: jitter is reported.
+# A trial has another period if the relative difference exceeds this. Larger: other speeds pass.
+# Smaller: jitter is reported.
 _OTHER_PERIOD = 0.02
-# Fewest cycles that have a usual duration. Larger: short trials are not judged. Smaller: chance is.
+# Least number of cycles for which a usual duration is defined. Larger: short trials are not tested.
+# Smaller: chance is reported.
 _STRETCH = 8
-# Difference from the median duration of cycles that makes an odd one, in medians of differences and
-# in periods. Larger: lost samples pass. Smaller: variable rhythms are reported.
+# A cycle is odd if its duration differs from the median by more than this, in medians of such
+# differences, and by a part of the period. Larger: lost samples pass. Smaller: variable rhythms are
+# reported.
 _ODD = 12.0
 _ALIKE_PERIODS = 0.05
 # Fewest steps of time from which a grid of stamps is found, most different ones, and the least grid
@@ -40,9 +48,9 @@ _ALIKE_PERIODS = 0.05
 _STAMPS = 50
 _MOST_STEPS = 6
 _COARSE = 0.2
-# Part of the variance of durations, or of outputs, that changes sign from cycle to cycle if two
-# kinds of cycles alternate. Larger: alternating steps pass. Smaller: multipliers of -0.9 are
-# reported in short recordings.
+# Two kinds of cycles alternate if more than this part of the variance of durations or outputs
+# changes its sign from cycle to cycle. Larger: alternating steps pass. Smaller: multipliers of -0.9
+# are reported in short recordings.
 _ALTERNATING = 0.5
 # Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
 # that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
@@ -105,11 +113,11 @@ def _swapped(
     usual: Float[np.ndarray, " k"],
     usual_width: Float[np.ndarray, " k"],
 ) -> Bool[np.ndarray, "k k"]:
-    """Return which pairs of signals are each where the other one usually is, and not where they
-    usually are themselves."""
+    """Return which pairs of signals have changed places: each has the usual range of the other one,
+    and not its own."""
     narrower = np.minimum(width[:, None], usual_width)
     wider = np.maximum(width[:, None], usual_width)
-    # alike[i, j]: signal i is where signal j usually is.
+    # alike[i, j]: signal i has the usual range of signal j.
     alike = np.abs(middle[:, None] - usual) < narrower
     alike &= narrower * _ALIKE > wider
     at_home = np.diag(alike)
@@ -163,7 +171,7 @@ def clocks(recording: Recording) -> Iterator[Finding]:
 
 
 def coarse_stamps(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
-    """Find times that are multiples of a step which is not that of the samples."""
+    """Find times that are multiples of a coarse step, which is not the time between samples."""
     for trial in recording.trials:
         for name in names:
             x = trial.values[:, recording.column(name)]
@@ -199,7 +207,7 @@ def _grid_of(step: Series) -> float | None:
     grid = float(rises[is_rise].min())
     count = step / grid
     off = np.abs(count - np.round(count)).max()
-    # Steps of once and twice the usual one are those of lost samples, too.
+    # (Steps of once and twice the usual one also come from lost samples.)
     is_multiple = abs(grid / usual - 1) < _COARSE / 2
     if off > 0.05 or is_multiple or grid < _COARSE * usual:
         return None
@@ -292,7 +300,7 @@ def other_cycles(
     if len(known) < 2:
         return
     for s in known:
-        # A trial among three or more does not move their median far.
+        # (In three or more trials, the trial itself hardly changes the median.)
         peers = known if len(known) > 2 else known[known != s]
         usual = np.median(mean[:, peers], axis=1)
         yield from _difference(mean[:, s], usual, names[s], outputs)
@@ -316,7 +324,7 @@ def _other_periods(phase: Phase, names: Sequence[str]) -> Iterator[Finding]:
 
 
 def _average_cycles(recording: Recording, phase: Phase, name: str) -> Cycles:
-    """Return the mean of a signal at each phase, without the mean of all, for each trial."""
+    """Return the average cycle of a signal in each trial, less its mean."""
     cycles = []
     for trial, x, parts in phase.samples(recording, name):
         at = np.full(len(x), np.nan)

@@ -1,8 +1,10 @@
-"""`Population`: estimates of several subjects, with their errors, and what they say together.
+"""`Population`: estimates of several subjects with their errors; means, differences and predictions
+over subjects.
 
 A mean or a difference takes three stages: trials of a subject are merged (`_trials`, `_merged`),
 the means are fitted (`reml.py`), and contrasts of them become rows of a table (`_effects`). Checks
-of the subjects' table are in `tables.py`.
+of the subjects' table are in `tables.py`. A wrong mean or error has its cause in `reml.py`; a wrong
+number of subjects, in `_merged`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,8 +30,9 @@ from .tables import Columns, cells_of, factors_of, require, rows_with, signed, t
 
 Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True)]]
 _SLOPE = "slope of "
-# Fewest subjects whose distribution is tested, and the level. Fewer subjects: the test sees
-# nothing. Larger level: normal subjects are doubted. Smaller: outliers pass.
+# Least number of subjects whose distribution is tested, and level of the test. Fewer subjects: the
+# test has no power. Larger level: normally distributed subjects get a finding. Smaller: outliers
+# pass.
 _FEWEST_TESTED = 5
 _NORMAL = 0.02
 Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
@@ -525,8 +528,8 @@ def _decay(modulus: float, variance: float) -> tuple[float, float]:
     """Return the rate at which a deviation decays per stride, and its variance; NaN for a modulus
     of zero.
 
-    (A half-life is no quantity to take means of: its error grows with it, so that weights by errors
-    favor the short ones, and it has no value where nothing decays.)
+    (Means of half-lives would be biased: their errors grow with their values, so that weights by
+    errors favor short half-lives. And there is no half-life if deviations do not decay.)
     """
     if modulus == 0:
         return np.nan, np.nan
@@ -535,7 +538,7 @@ def _decay(modulus: float, variance: float) -> tuple[float, float]:
 
 def _polar(fit: MultiplierFit | NaturalMultipliers) -> tuple[float, float, list[float]]:
     """Return modulus and angle of the leading multiplier, and their variances. The angle of a real
-    one is NaN."""
+    multiplier is NaN."""
     z = complex(fit.multipliers[0])
     covariance = fit.multiplier_covariances[0]
     # Derivatives of modulus and angle with respect to real and imaginary part.

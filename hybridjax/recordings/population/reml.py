@@ -1,4 +1,5 @@
-r"""Means of estimates whose errors are known: restricted maximum likelihood, small samples.
+r"""Means over subjects of estimates with known errors: restricted maximum likelihood, for small
+samples.
 
 The estimate of subject s in cell c (its group and condition) is
 
@@ -7,6 +8,10 @@ N(0, v_{sc})$$
 
 with known $v_{sc}$ (meta-analysis: Hardy and Thompson 1996; Jackson, Riley and White 2011). Mixed
 models of other libraries estimate one variance of all errors instead.
+
+`population.py` calls `mixed` (several groups or conditions) or `meta` (one estimate for each
+subject), and gets a `Mixed`, whose `contrast` gives differences. `moderated` first reduces the
+scatter of variances from few blocks.
 """
 
 from typing import Any, NamedTuple
@@ -20,8 +25,8 @@ Reals = Float[np.ndarray, " N"]
 Design = Float[np.ndarray, "N p"]
 Labels = Int[np.ndarray, " N"]
 
-# Degrees of freedom that count as infinite. More: roots of digamma functions overflow. Fewer: exact
-# variances are moderated.
+# From this number on, degrees of freedom count as infinite. More: roots of digamma functions
+# overflow. Fewer: exact variances are moderated.
 _EXACT = 1e9
 
 
@@ -30,7 +35,7 @@ class Mixed(NamedTuple):
 
     coefficients: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
-    """For small samples."""
+    """Covariance of the coefficients, corrected for small samples."""
     between: Float[np.ndarray, "q q"]
     """Psi, the covariance between subjects."""
     plain: Float[np.ndarray, "p p"]
@@ -40,7 +45,7 @@ class Mixed(NamedTuple):
     uncertainty: Float[np.ndarray, "k k"]
     """Covariance of the elements of Psi."""
     most: int
-    """Degrees of freedom of a t test: subjects beyond the number of coefficients."""
+    """Degrees of freedom of a t test: number of subjects less number of coefficients."""
 
     def contrast(self, w: Float[np.ndarray, " p"]) -> tuple[float, float, float]:
         """Return value, standard error and degrees of freedom of a contrast (of a single one, those
@@ -182,9 +187,9 @@ def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
 
 
 def moderated(v: Reals, dof: Reals, trend: Design) -> Reals:
-    """Return variances with less scatter: means of each, weighted by its degrees of freedom, and of
-    the common trend of their logarithms, weighted by the freedom that fits their scatter (empirical
-    Bayes: Smyth 2004).
+    """Return variances with less scatter (empirical Bayes: Smyth 2004). Each is a weighted mean of
+    the variance itself and of the common trend of all variances. The weight of the former is its
+    degrees of freedom; the weight of the latter follows from the scatter of the variances.
 
     Variances that are estimated from few blocks would otherwise give the largest weights to
     subjects whose errors happen to be underestimated.
@@ -198,7 +203,8 @@ def moderated(v: Reals, dof: Reals, trend: Design) -> Reals:
     mean = trend @ np.linalg.lstsq(trend, log)[0]
     scatter = np.sum((log - mean) ** 2) / surplus
     excess = scatter - special.polygamma(1, half).mean()
-    # The half of the prior freedom, at which a log chi-squared has the variance of the excess.
+    # Half of the prior degrees of freedom, with which a log chi-squared variable has the excess
+    # variance.
     prior = _EXACT
     if excess > 1 / _EXACT:
         prior = _root(lambda half: special.polygamma(1, half) - excess, 1e-3, _EXACT)

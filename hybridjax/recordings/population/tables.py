@@ -1,4 +1,8 @@
-"""Tables of a study, as data frames: who was recorded, and results."""
+"""Tables of a study as data frames: the subjects with their groups and conditions.
+
+`Population` and `PopulationMaps` call `table_of` to check a table, `cells_of` and `rows_with` to
+select rows, and `signed` for the sentences of a methods section.
+"""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
