@@ -1,4 +1,10 @@
-"""The result of a fit of physical parameters, and the combinations that data identify."""
+"""`ModelFit`: the result of a fit of physical parameters; and `Identifiability`, the combinations
+of parameters that data identify.
+
+`fit.py` makes both. `diagnose` finds combinations without effect from the singular values of the
+sensitivities, and `_readable` and `_rounded` bring them to a form with small integers.
+`ParameterFit` has what does not need the system: standard errors, confidence regions, comparisons.
+"""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -30,10 +36,10 @@ from .problem import DELAYS, FitProblem, of_system
 # Singular values of the sensitivities below this, or below this part of the largest one, are zero.
 # Larger: badly identified combinations count as unidentifiable. Smaller: rounding identifies them.
 _RANK = 1e-9
-# Entries of a direction this close to zero, or to ratios of integers with denominators up to the
-# largest one, are replaced by these (they have no unit); a basis is solved for entries whose
-# smallest singular value is above it. Larger: exponents that are none are printed as integers.
-# Smaller: rounding of derivatives is printed.
+# Entries of a direction (without unit) that are this close to zero, or to a ratio of integers with
+# a denominator up to `_LARGEST_DENOMINATOR`, are replaced by it. A basis is solved for entries
+# whose smallest singular value exceeds this. Larger: wrong exponents are printed as integers.
+# Smaller: rounding errors of derivatives are printed.
 _CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
 
 
