@@ -81,7 +81,8 @@ def step_along(
     along: States,
     some: Some,
 ) -> tuple[Step, States, States]:
-    """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
+    """A step in chart a, and the derivatives of its end and of its error estimate along a direction
+    of states."""
     method = _ByMethod(_step_along, s.method(a))
     of_lanes = s.kernel(_field, method, a)
     *step, end, estimate = of_lanes(t, q, u, h, along, some=some)
@@ -114,7 +115,7 @@ def watched(
         of_point = _columns(ft.partial(watched_at, *static))
         return s.by_lane(of_point, levels)(t, q, u, index)
     if lanes is None:
-        # (A program for many points is worth its compilation from so many calls on.)
+        # (Compiling a program for many points pays only if there are many points.)
         lanes = 1 if q.shape[-1] < 4 * POINTS else POINTS
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)

@@ -216,7 +216,7 @@ class Moves(NamedTuple):
     code: Int[np.ndarray, " M"]
     lane: Int[np.ndarray, " M"]
     order: Int[np.ndarray, " M"]
-    """Number of moves of the same lane before this one."""
+    """Number of earlier moves of the same lane."""
     at_once: Bool[np.ndarray, " M"]
     """See `Tape`."""
 
@@ -419,7 +419,8 @@ def _until_ticks(
 def linear_moves(
     s: Structure, moves: Moves, target: Target
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
+    """(t, q) after some moves, (M, n); and the derivatives of these by (t, q, u) before the moves,
+    (M, n, m)."""
     n = 1 + s.d
     M = len(moves.t)
     number = target.time.dtype
@@ -570,7 +571,7 @@ def _at_zeros(
     field = expanded[:, :, :1]
     by_field = by_point(expanded, n)
 
-    # Each move has its own function that is zero.
+    # Each move ends at the zero of its own watched function.
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
     is_crossed = np.array(flow.rows)[:, None] == crossed
     row = np.argmax(is_crossed, axis=0)

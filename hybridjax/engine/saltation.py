@@ -47,8 +47,8 @@ def chained(
     dt: Inexact[np.ndarray, "P 1 m"],
     dq: Inexact[np.ndarray, "P n m"],
 ) -> Inexact[np.ndarray, "P k m"]:
-    """Derivatives of a function of (t, q, u) by those of t and q with respect to m numbers, the
-    last of which are the inputs u."""
+    """Derivatives of a function of (t, q, u) by m numbers, from the derivatives `dt` and `dq` of t
+    and q by these numbers (chain rule). The last of the m numbers are the inputs u."""
     out = by.by_t @ dt + by.by_q @ dq
     inputs = by.by_u.shape[2]
     out[:, :, out.shape[2] - inputs :] += by.by_u

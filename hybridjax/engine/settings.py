@@ -26,8 +26,8 @@ from .arrays import AnyTimes, Array, States
 from .runge_kutta import Step
 
 
-# Default accuracies: the error that one step may have, relative to the size of each state. A tenth
-# of the accuracy costs about 1.4 times as many steps (the method has order 7).
+# Default accuracies: the error that one step may have, relative to the magnitude of each state.
+# With a ten times smaller error, there are about 1.4 times as many steps (the method has order 7).
 SIMULATION = 1e-10
 """Single trajectories (`simulate`)."""
 LIMIT_CYCLE = 1e-12
@@ -135,8 +135,8 @@ def _kept(x: Any) -> Any:
 
 
 def size(settings: Settings, a: int, *q: States) -> States:
-    """Magnitudes of states of chart a, relative to which errors are judged: those of `q`, but at
-    least the magnitudes in `settings.scale`.
+    """Magnitudes of states of chart a, relative to which errors are judged: the largest modulus
+    among `q`, plus `atol / rtol` times the magnitude in `settings.scale`.
 
     If `settings.scale` is None, a state that is zero gets the magnitude of the largest state. If
     all states are zero, they get 1.

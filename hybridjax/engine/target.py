@@ -42,8 +42,8 @@ class AbstractLevels(Definition):
 
 
 class Target(eqx.Module):
-    """The ends of a piece of flow, one per lane. Section and event may be the same for all, as
-    arrays of one."""
+    """The ends of a piece of flow, one per lane. Section and event may be arrays with a single
+    entry, which then holds for all lanes."""
 
     time: Float[Array, " L"]
     """End at this time; infinity if the end is not at a known time."""

@@ -416,7 +416,8 @@ def jumps(
         distance = lengths.max(axis=2, keepdims=True)
         usual = changes.mean(axis=0)
         uneven = np.abs(changes - usual) / limit
-        # The quarter of each interval in which the field changes most unlike in the others.
+        # The quarter of each interval in which the change of the field differs most from the other
+        # quarters.
         worst = uneven.max(axis=2).argmax(axis=0)
         here = np.arange(len(low))
         low = points[worst, here]

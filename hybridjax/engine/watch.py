@@ -70,8 +70,8 @@ class Located(NamedTuple):
 
 
 class ChartFlow(NamedTuple):
-    """The field and the watched functions of one chart, under the inputs of lanes and for their
-    targets: levels by index."""
+    """The field and the watched functions of one chart. Inputs and targets are those of the lanes;
+    a target gives its level function by index."""
 
     s: Structure
     a: int
@@ -244,7 +244,8 @@ def no_events(s: Structure, t: Times) -> Watch:
 
 
 def write(out: Watch, rows: list[int], here: Mask, new: Watch) -> Watch:
-    """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
+    """`out` with some rows replaced by those of `new`, for the lanes `here`. `rows`: the rows in
+    `out`."""
     value = put_rows(out.value, rows, here, new.value)
     rate = put_rows(out.rate, rows, here, new.rate)
     return Watch(value, rate)

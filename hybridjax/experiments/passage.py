@@ -321,7 +321,7 @@ class _Moves:
         return x._replace(output=jnp.where(x.fresh, output, x.output))
 
     def _stepped(self, a: int, u, t, q, h):
-        """The state after a step, and its error relative to what is allowed."""
+        """The state after a step, and the error of the step relative to the allowed one."""
         # (Not by diffrax, whose step takes twice as long, since it writes stages by `K.at[k].set`.)
         field = self._field(a, u)
         end, error = looped_step(self.s.method(a), field, t, q, h)

@@ -97,9 +97,10 @@ class Plan(eqx.Module):
     - `h`: first step. `lead`: time to section k + 1 as a multiple of Newton's guess at section k.
     - `slack`: a step's error estimate may be this many times the tolerance.
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
-        cycle and relative to the states' scales: the largest that it ever leads to at a later
-        section, summed over all periods as if each made the same error.
-    - `least`: error of experiments whose steps seem to have none, in charts with implicit methods.
+      cycle and relative to the states' scales: it is the largest error that the step causes at any
+      later section, if each period makes the same error.
+    - `least`: least error estimate, for experiments in charts with implicit methods whose steps
+      seem to have no error.
     """
 
     h: Float[Array, " N"]

@@ -134,8 +134,8 @@ RecordedData = HasRecords | Annotated[Iterable[HasRecords], Stream(HasRecords, "
 def uninterrupted_records(data: RecordedData) -> list[SectionSeries]:
     """Return all records, cut at unknown inputs: no input in the result is NaN.
 
-    The output at an unknown input is not used, as it may depend on it directly, nor are those up to
-    `lead` samples earlier.
+    The output at an unknown input is not used, since it may depend on this input directly. With
+    `lead`, the outputs up to `lead` samples earlier are not used, either.
 
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """

@@ -47,9 +47,9 @@ from ..systems.system import HybridSystem, Output, OutputNames, arrays_of
 from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 
 
-# Steps that a derivative may use between two of as many sections, and its square in a period of the
-# cycle. Fewer: experiments far from the cycle fail at the limit on steps. More: derivatives need
-# more memory.
+# With derivatives, the limit on the number of steps: this number between two sections if there are
+# as many sections, or its square in a period. Fewer: experiments far from the cycle reach the
+# limit. More: derivatives need more memory.
 _STEPS = 32
 
 

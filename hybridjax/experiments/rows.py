@@ -185,7 +185,7 @@ def _of_length(table: Table, other: Table) -> Table:
 
 
 class _Writer:
-    """Writes the rows of a table, one after the other."""
+    """Writes the rows of a table one by one."""
 
     def __init__(self, placed: PlacedSections, plan: Plan, spare: bool, density: int):
         self.placed = placed
@@ -477,7 +477,8 @@ class _Writer:
         return self.places.setdefault((section, passed), len(self.places))
 
     def _event_kind(self, g: int) -> tuple[int, Kind, int]:
-        """The chart that a transition leaves, its kind, and its index there."""
+        """The chart that a transition leaves, the kind of the transition, and its index within the
+        kind."""
         member: Member = self.s.member(g)
         a = self.s.chart_index(self.s.transitions[g].source)
         return a, member.kind, int(member.place[0])

@@ -24,8 +24,8 @@ from .plan import Stepping
 
 StartName = Literal["cycle", "periodic", "steady"]
 
-# Newton steps. Fewer: large inputs have no steady start. More: it takes longer to report that there
-# is none.
+# Largest number of Newton steps. Fewer: large inputs have no steady start. More: if there is no
+# steady start, this is reported later.
 MOST_STEPS = 12
 
 # A Newton step below this part of the accuracy is not taken, so that experiments need not run

@@ -87,8 +87,8 @@ def sandwich(
 
     **Arguments:** `curvature`: K. `gradient`: M, the covariance of the gradient. `shares`: the
     expected contributions of independent parts, if M was estimated from these. The degrees of
-    freedom are then the number of parts that contribute: one over the sum of the squares of their
-    shares (Satterthwaite 1946). Default: M is exact.
+    freedom are then one over the sum of the squared shares (Satterthwaite 1946). Default: M is
+    exact.
     """
     values, vectors = np.linalg.eigh(curvature)
     if not values[0] > ROUNDING * values[-1]:
@@ -147,11 +147,10 @@ def block_freedom(
 ) -> float:
     """Return the degrees of freedom of a covariance from the scores of independent blocks.
 
-    From their dispersion (Pan and Wall 2002), at most those of Gaussian errors (Satterthwaite
-    1946).
+    They follow from the dispersion of the scores (Pan and Wall 2002), and are at most those for
+    Gaussian errors (Satterthwaite 1946).
 
-    **Arguments:** `share`: the expected contribution of each block, in units in which they add up
-    to one.
+    **Arguments:** `share`: the expected contribution of each block; contributions add up to one.
     """
     d = score.shape[1]
     inverse = np.linalg.pinv(score.T @ score)

@@ -74,7 +74,8 @@ class Fit(WithMultipliers, eqx.Module):
 
     @abstractmethod
     def _estimates(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Return the real numbers of which `interval` gives bounds, and their standard errors."""
+        """Return the real numbers for which `interval` gives bounds, and the standard errors of
+        these numbers."""
 
     def _linear_model(self, data: Any) -> Any:
         """Return the `LDTP` that is simulated on data to validate the fit.

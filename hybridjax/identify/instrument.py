@@ -236,7 +236,8 @@ def solve(
 ) -> HTF:
     """Return the HTFs from the inputs to the outputs in the classes that the references excite.
 
-    **Raises:** `DefinitionError` if there are none, or the inputs do not answer the references.
+    **Raises:** `DefinitionError` if there are no such classes, or if the inputs do not respond to
+    the references.
     """
     N = sums.setup.n_sections
     P = sums.setup.periods

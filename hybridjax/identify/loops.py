@@ -154,7 +154,8 @@ def _require_references(what: str, given: Names, needed: Names) -> None:
 
 
 def _without(sums: Sums, rows: np.ndarray) -> Sums:
-    """Return products of the residuals of all signals, after regression on those in these rows.
+    """Return the products of spectra after regression of all signals on the signals in `rows`
+    (products of the residuals).
 
     Each of these rows takes one degree of freedom.
     """

@@ -73,7 +73,8 @@ _BORDER_POINTS = 100
 
 
 class MultiplierComparison(Showable, eqx.Module):
-    """Estimated Floquet multipliers, each paired with a true one, or with one of another fit.
+    """Estimated Floquet multipliers, each paired with a true multiplier or with a multiplier of
+    another fit.
 
     The pairing has the smallest sum of distances; if the numbers of multipliers differ, the
     unpaired ones are not listed. Printing it shows a table.
@@ -190,7 +191,8 @@ class MultiplierFit(Fit):
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
-        """Root of the expected squared distance of each multiplier from the true one."""
+        """Standard error of each multiplier: the square root of the expected squared distance from
+        the true multiplier."""
         return np.sqrt(np.linalg.trace(self.multiplier_covariances))
 
     def _estimates(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
@@ -492,7 +494,8 @@ def order_doubts(
 
 
 def left_out(higher: Callable[[], RoughFit]) -> list[Finding]:
-    """Return a finding if a fit of one more multiplier, begun at a fit, needs it.
+    """Return a finding if a fit needs one more multiplier. `higher`: a fit with one more multiplier
+    that starts from it.
 
     With the same numerators, the present fit is the higher fit with a last coefficient of zero. If
     this coefficient differs from zero (Wald's test), the present fit has left out a multiplier.

@@ -241,7 +241,8 @@ class _Solution(NamedTuple):
 def _solve(
     htf: HTF, rms: Float[np.ndarray, " ny"], order: int, extra_lags: int | None
 ) -> _Solution:
-    """Return the solution weighted by variances, or else by those that its residuals suggest."""
+    """Return the solution weighted by the variances of the HTFs; if there are none, by variances
+    estimated from its residuals."""
     size = varpro.numerator_size(htf, order, extra_lags)
     weight = weights.error_weights(htf, rms)
     groups = varpro.group_htf(htf, weight, size)

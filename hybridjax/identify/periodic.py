@@ -167,7 +167,7 @@ class LocalCoordinates(NamedTuple):
 
     @property
     def places(self) -> list[dict[str, slice]]:
-        """The entries of each block in a vector of coordinates, for each section."""
+        """For each section, the slice of each block in a vector of coordinates."""
         out = []
         first = 0
         for n in range(self.model.n_sections):

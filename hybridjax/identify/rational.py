@@ -93,8 +93,8 @@ class RationalFit(WithMultipliers, eqx.Module):
     def compare(
         self, other: Truth, output: str | int | None = None
     ) -> MultiplierComparison:
-        """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
-        There is no test: the errors of this fit are not known.
+        """Pair the multipliers of each output (or of one output) with the true multipliers. There
+        is no test: the errors of this fit are not known.
 
         **Raises:** `DefinitionError` for an output that is not there.
 

@@ -1,10 +1,10 @@
 r"""State-space models from impulse responses, and the steps that all realizations share.
 
 The state at a section represents the effect of earlier inputs on the outputs from there on. Its
-dimension is a rank at each section: that of the Hankel matrix whose block `[i, j]` is the response
-at section n + i to an input at section n - 1 - j (Ho and Kalman 1966, for each section of the
-period). The range of this matrix is the observability matrix O[n], and A[n] follows from O[n],
-shifted by one section, and O[n+1].
+dimension at section n is the rank of a Hankel matrix, whose block `[i, j]` is the response at
+section n + i to an input at section n - 1 - j (Ho and Kalman 1966, for each section of the period).
+The range of this matrix is the observability matrix O[n], and A[n] follows from O[n], shifted by
+one section, and O[n+1].
 
 `realized` makes a model from impulse responses (for `SeriesFit.model`, bounds and designs).
 `ranges` and `shifted` are also used by `joint/realization.py`.

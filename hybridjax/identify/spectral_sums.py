@@ -25,7 +25,7 @@ from .descent import ROUNDING, positive
 Experiments = (
     ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
 )
-"""Experiments, or parts of them one after the other."""
+"""Experiments, or an iterable of parts of them."""
 
 
 # The input repeats if each of its lines changes from window to window by less than this, relative
@@ -97,7 +97,8 @@ class SpectralSums(NamedTuple):
     noise: Float[np.ndarray, "K M ny"]
     """Sums of the variance of Y[k + l P] between windows; zero for one window."""
     crest_factors: tuple[int, int]
-    """Signals that were tested, and those with crest factors below all redraws of their phases."""
+    """Number of signals that were tested, and number of those with a crest factor below all redraws
+    of their phases."""
     repeats: int
     """The number of windows that were averaged."""
     experiments: tuple[int, int]
@@ -151,7 +152,7 @@ def _sums_of_part(
     repeats: int,
     first: int,
 ) -> SpectralSums:
-    """Return the sums over one part, whose first experiment has the number `first`."""
+    """Return the sums over one part of the experiments. `first`: number of its first experiment."""
     windows = data.windows(repeats)
     experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
@@ -198,7 +199,8 @@ def _sums_of_part(
 
 
 def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
-    """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
+    """Return, for each entry k, the mean of Y over the windows at lines k + m P, and the variance
+    of this mean."""
     N = data.n_sections
     P = data.periods
     shifts = P * np.asarray(harmonics, int)

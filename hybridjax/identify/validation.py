@@ -51,7 +51,8 @@ _SAMPLES_PER_UNKNOWN = 3
 def can_be_compared(
     model: LDTP | SeriesFit | Predictor, record: SectionSeries, free_start: bool
 ) -> bool:
-    """Test whether a record has samples beyond those that fit its initial condition and drift."""
+    """Test whether a record has enough samples, beyond those that determine its initial condition
+    and drift."""
     N = record.n_sections
     ny = record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
@@ -301,7 +302,7 @@ def validate(
     if not isinstance(tested, LDTP) and not isinstance(model, LDTP):
         roots = list(model.spread(grid))
     if isinstance(tested, LDTP):
-        # Outputs in units of their size, so that none is neglected.
+        # (Outputs in units of their magnitude, so that all have the same weight.)
         of_section = np.diag(prepared.scale**2)
         S = np.tile(of_section, (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)

@@ -303,7 +303,7 @@ def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"
 def unfold(
     htf: HTF, groups: list[HTFGroup], numerators: Sequence[Inexact[np.ndarray, "R K"]]
 ) -> Complex[np.ndarray, "M R ny nu"]:
-    """Return the numerators of the HTFs from those of the responses of each group."""
+    """Return the numerators of the HTFs, from the numerators of the responses of each group."""
     _, _, ny, nu = htf.H.shape
     shape = (len(htf.harmonics), ny, nu, len(numerators[0]))
     out = np.zeros(shape, complex)
@@ -318,7 +318,8 @@ def unfold(
 
 
 def grouped(htf: HTF, order: int, extra_lags: int | None) -> list[HTFGroup]:
-    """Group all entries of the HTFs, weighted by their variances, for so many multipliers."""
+    """Group all entries of the HTFs, weighted by their variances, for a fit with `order`
+    multipliers."""
     size = numerator_size(htf, order, extra_lags)
     return group_htf(htf, error_weights(htf, check_values(htf)), size)
 
@@ -414,10 +415,10 @@ def equal_weights(
     matrix: Complex[np.ndarray, "E u"],
     responses: list[FittedResponse],
 ) -> list[HTFGroup]:
-    """Return responses whose numerators solve the same problem, one group for each weight.
+    """Group responses whose numerators solve the same problem, one group for each weight.
 
-    **Arguments:** `sources`: for each frequency the number of its noise, see `HTFGroup.line`.
-    `matrix`: maps u real coefficients to the numerator's values.
+    **Arguments:** `sources`: number of the noise of each frequency, see `HTFGroup.line`. `matrix`:
+    maps u real coefficients to the numerator's values.
     """
     harmonic, share, channel, data, weights = map(
         np.array, zip(*responses, strict=True)

@@ -55,9 +55,9 @@ def error_weights(
     """Return one over the standard deviation of real and imaginary part, known or supposed.
 
     Variances that were estimated with few degrees of freedom are poor weights: they are replaced by
-    the nearest product of a factor for each frequency and one for each modulus of a harmonic. (For
-    white noise, variances have this form whatever the spectrum of the input is.) If any variance is
-    zero, variances are used as they are.
+    the nearest product of two factors: one for each frequency, and one for each modulus of a
+    harmonic. (For white noise, variances have this form whatever the spectrum of the input is.) If
+    any variance is zero, variances are used as they are.
 
     **Arguments:** `rms`: rms of each output. Without variances, the standard deviation is assumed
     to be a constant part of the rms, times that of white noise at each line (`line_variances`).
@@ -77,7 +77,8 @@ def _separated(
     variance: Float[np.ndarray, "M F ny nu"],
     dof: Float[np.ndarray, " F"],
 ) -> Float[np.ndarray, "M F ny nu"]:
-    """Return the nearest product of a factor for each frequency and one for each harmonic."""
+    """Return the nearest product of two factors: one for each frequency, and one for each modulus
+    of a harmonic."""
     _, same = np.unique(np.abs(harmonics), return_inverse=True)
     groups = same.max() + 1
     size = np.ones((groups, 1, *variance.shape[2:]))
@@ -91,7 +92,8 @@ def _separated(
 
 
 def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
-    """Return variances of each frequency and input by white noise, relative to their mean."""
+    """Return the variances that white noise causes at each frequency and input, relative to their
+    mean."""
     if htf.power is None:
         return np.ones((len(htf.frequencies), 1, len(htf.inputs)))
     variance = 1 / np.asarray(htf.power)[:, None]

@@ -353,7 +353,7 @@ def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
 
 
 def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
-    """The numbers of systems, one row for each."""
+    """The parameters of systems, one row for each system."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
     rows = [np.asarray(x).reshape(len(x), -1) for x in arrays]
     return np.concatenate(rows, axis=1)
@@ -403,7 +403,8 @@ def _of_one_width(parts):
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
-    """`out` with other values in some rows, which are written in place if they fit."""
+    """`out` with the values of `new` in some rows. They are written in place if their shapes
+    agree."""
 
     def put(x, y):
         x, y = _of_one_width((x, y))

@@ -39,7 +39,7 @@ _SMALL = 0.02
 # branch ends before.
 _REST = 0.1
 
-# Results of a turn that failed beyond the end of a branch, and may have one of these causes.
+# Results of a failed turn for which a cause is looked for.
 _UNCLEAR = (
     Result.GRAZING,
     Result.EVENT_ORDER,

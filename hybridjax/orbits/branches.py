@@ -259,9 +259,9 @@ def continuation(
 
 
 def _at_event(cycle: LimitCycle) -> LimitCycle:
-    """If the section of a cycle is the default plane through a guess, the cycle with the state
-    after its first event as the beginning. (Other cycles of the branch may not cross that
-    plane.)"""
+    """Let a cycle begin at an event, if its section is the default plane through a guess. (Other
+    cycles of the branch may not cross this plane.) Cycles with another section are returned as they
+    are."""
     if not is_default(cycle.base) or not cycle.event_sequence:
         return cycle
     events = cycle.trajectory().events
@@ -286,7 +286,8 @@ def _at_event(cycle: LimitCycle) -> LimitCycle:
 def _branch(
     curve: Curve, points: list[Point], start: int, ends: tuple[BranchEnd, BranchEnd]
 ) -> Branch:
-    """The branch through some points. It ends before points whose verdict has a fault.
+    """The branch through some points. The branch ends before the first point whose verdict has a
+    fault.
 
     **Arguments:** `start`: the index of the first cycle.
     """
@@ -358,7 +359,8 @@ def _check(cycle, values) -> np.ndarray:
 
 
 class _Trace(NamedTuple):
-    """A curve between the least and the largest of some values, in steps."""
+    """The curve of cycles, followed step by step between the least and the largest of the given
+    parameter values."""
 
     curve: Curve
     values: np.ndarray
@@ -462,7 +464,7 @@ class _Trace(NamedTuple):
         from scipy.optimize import brentq  # (a third of a second)
 
         points = {0.0: a, 1.0: b}
-        beside: set[float] = set()  # where only a point beside could be computed
+        beside: set[float] = set()  # (only a point nearby could be computed)
 
         def compute(where: float) -> None:
             for aside in _ASIDE:

@@ -527,7 +527,7 @@ def _about_decisions(s: Structure) -> str:
 
 
 def _about_guards(s: Structure, turn: Turn, better: str) -> str:
-    """The values of the guards, if none of them led to an event."""
+    """A sentence with the values of the guards, if no guard led to an event."""
     if turn.events or not s.transitions:
         return ""
     values: dict[int, list[float]] = {}

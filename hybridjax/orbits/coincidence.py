@@ -54,9 +54,9 @@ class SimultaneousEvents(NamedTuple):
     """The names of the events, in every order in which they can happen. (In some orders an event
     may be missing: the reset of another event has moved its guard away from zero.)"""
     derivatives: tuple[Float[np.ndarray, "m n"], ...]
-    """For each order, the derivative of the state after all events with respect to the state
-    before them, at the same time (a product of saltation matrices). It holds for neighbors of the
-    cycle that reach the events in this order."""
+    """For each order, the derivative of the state after all events by the state before all events,
+    at the same time (a product of saltation matrices). It holds for neighbors of the cycle that
+    reach the events in this order."""
     commute: bool
     """Whether all orders lead through as many events to the same state, with the same derivative.
     Orders of more than six events are not compared: `orders` then has only the order on the cycle,
@@ -200,7 +200,7 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     change = direct + by_q @ by_reset
     by_rows = np.abs(by_q) @ np.abs(by_reset)
     size = np.abs(direct) + by_rows
-    if is_scheduled:  # (its time is the same in all neighbors)
+    if is_scheduled:  # (its time is the same on all trajectories)
         change[0] = 0.0
     return bool((np.abs(change) <= ROUNDING * size).all())
 
@@ -281,7 +281,8 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
 
 
 def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Order]:
-    """All orders in which events can happen at once after those before, until none is due."""
+    """Iterate over all orders in which events can happen at one time, after the events in `before`,
+    until no further event is due."""
     a = before.chart
     q = before.state[None]
     u = np.zeros((s.nu, 1))

@@ -53,9 +53,9 @@ class Point:
     """A cycle on the curve.
 
     **Fields:** `anchor`, chart and phase (as the time of the first cycle's clock) at which it
-    begins; `z` (n,), state (padded) and parameter; `size` (n,), what counts as 1 in each; `tangent`
-    (n,) of the curve, a unit vector in these sizes; `turn` from there, with derivatives with
-    respect to `z`; `steps` of Newton; `kind` of a change of stability there.
+    begins; `z` (n,), state (padded) and parameter; `size` (n,), the unit of each entry of `z`;
+    `tangent` (n,) of the curve, a unit vector in these sizes; `turn` from there, with derivatives
+    with respect to `z`; `steps` of Newton; `kind` of a change of stability there.
     """
 
     anchor: Lanes

@@ -265,8 +265,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         with other steps (at the first access).
 
         A cycle that `find_limit_cycle` returns has passed these checks, so that no finding is
-        "refused". One of a sweep or of a branch was checked at its guards; here it is checked in
-        full.
+        "refused". A cycle of a sweep or of a branch was checked at its guards only; here it is
+        checked in full.
         """
         _require_values(self, "findings")
         self.require_current()
@@ -424,8 +424,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
             the state, or of the input, times the square root of time. Default: none.
         - `guards`: standard deviations of the level of a transition's guard, or of the time of a
             scheduled event, by name. Default: none.
-        - `resets`: standard deviations of states after a transition, by its name and theirs.
-            Default: none.
+        - `resets`: standard deviations of states after a transition, by names of transitions and
+          states. Default: none.
 
         **Raises:** `DefinitionError` for names that do not exist; `ComputationError` for cycles
         that are not stable.
@@ -740,7 +740,7 @@ def log_determinant(cycle: LimitCycle) -> float:
 
 
 def orbit(cycle: LimitCycle) -> Trajectory:
-    """One turn from the anchor, in the steps by which it is linearized."""
+    """One period from the anchor, in the steps that are also linearized."""
     map = to_host(cycle.return_map)
     _, tape = last_turn(cycle)
 

@@ -654,7 +654,8 @@ def _with_sizes(map: ReturnMap, solution: Solution, sizes: Sizes) -> ReturnMap:
 
 
 def _with_distance_in(solution: Solution, map: ReturnMap, fine: ReturnMap) -> Solution:
-    """A solution of one return map, with the distance of its ends in the sizes of another."""
+    """The solution of one return map, with its distance expressed in the sizes of another return
+    map."""
     turn = solution.turn
     residual = np.abs(turn.residual)
     before = to_host(map).sizes

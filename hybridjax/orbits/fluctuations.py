@@ -100,9 +100,9 @@ class Fluctuations(Showable, eqx.Module):
         return self.flow.at(phase, self.period, covariance)[1]
 
     def durations(self, lag: Index = 0) -> Float[Array, "E E"]:
-        """Covariance of the durations that end at the `events` of a turn, each since the event
-        before, with those `lag` turns before. The sum of all entries is the covariance of periods
-        from the last event to the next such event."""
+        """Covariance of durations (from each event to the next one of `events`) with durations
+        `lag` periods before. The sum of all entries is the covariance of periods from the last
+        event to the next such event."""
         n = len(self.joint) - len(self.events)
         xp = namespace(self.joint)
         later = xp.linalg.matrix_power(self.step, lag) @ self.joint
@@ -135,8 +135,8 @@ def fluctuations(
 
 
 class _Pieces(NamedTuple):
-    """The pieces of a turn, each with the event at its end, for vectors of n numbers: the d states,
-    the delay of the last event, and the durations of the turn so far."""
+    """The pieces of one period, each with the event at its end. Matrices act on vectors of n
+    numbers: the d states, the delay of the last event, and the durations of the period so far."""
 
     forward: Float[Array, "P n n"]
     """The effect of the piece."""

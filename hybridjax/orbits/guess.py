@@ -127,7 +127,7 @@ def _own_guess(system: HybridSystem) -> Guess:
     """
 
     def of_host(x):
-        # (JAX would compile each operation on numbers of its own.)
+        # (By NumPy: JAX would compile a program for each operation.)
         return np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x
 
     guess = jax.tree_util.tree_map(of_host, system).guess()

@@ -381,7 +381,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
 
 
 def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
-    """Codes of events with those of other rows."""
+    """Codes of events, padded to as many columns as `more` has, if it has more."""
     width = max(codes.shape[1], more.shape[1])
 
     def fill(x):

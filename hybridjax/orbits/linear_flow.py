@@ -589,7 +589,8 @@ def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def of_flow(tangents: Any) -> Any:
-    """The tangents of a cycle on which its flow depends, others replaced by `None`."""
+    """The tangents of those fields of a cycle on which its flow depends; `None` for other
+    fields."""
     nothing = jax.tree_util.tree_map(lambda _: None, tangents)
     anchor = tangents.anchor
     anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)

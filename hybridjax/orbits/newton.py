@@ -302,7 +302,7 @@ def _newton(
         # (The initial state may be less accurate than a state after a Newton step.)
         small = excess(x[None], step[None])[0] < 1
         done = small and close and (travelled or steps > first + 1)
-        # (At infinity a turn may not close, although all states there do nearly the same.)
+        # (Far away, Newton steps may be small relative to the states although no turn closes.)
         stands = small and not travelled and steps > first + 1
         if done or stands or steps == max_steps or not np.isfinite(x).all():
             break

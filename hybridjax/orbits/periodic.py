@@ -74,7 +74,7 @@ def _with_rate(function, t, q) -> tuple[Array, Array]:
 
 
 def _schedules_fit(s: Structure, period: Float[Array, ""]) -> Bool[Array, ""]:
-    """Test whether the period of each schedule divides that of the clock."""
+    """Test whether the period of the clock is a multiple of the period of each schedule."""
     fit = jnp.asarray(True)
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):

@@ -1,4 +1,5 @@
-"""Responses of a cycle to brief pushes: of its phase, and of the amplitudes of its Floquet modes.
+"""Responses of a cycle to brief pushes: how much its phase and the amplitudes of its Floquet modes
+change.
 
 The phase response Z of a cycle satisfies dZ/dt = -(Df)^T Z along it, Z(t-)^T = Z(t+)^T S at events
 with the saltation matrix S, and Z . f = 1. The response I of the amplitude of a mode with the
@@ -61,7 +62,7 @@ Phases = Annotated[Numbers, Reals("p")]
 
 
 class PhaseCurve(Showable, eqx.Module):
-    """The phase response to one input over one cycle, of a model or measured.
+    """The phase response to one input over one cycle: computed from a model, or measured.
 
     **Fields:** `phase` (P,), in cycles; `values` (P,), in cycles per unit of time and of the input,
     with NaN between both sides of an event; `input`; `time_unit`.

@@ -335,7 +335,7 @@ class ReturnMap(eqx.Module):
     def _linear_in_program(
         self, q: Float[Array, " d"], record: Recorded | None
     ) -> "_Linear":
-        """A turn whose pieces are linearized one after the other."""
+        """A turn whose pieces are computed and linearized one after the other."""
         s = self.structure
 
         def flow(lanes, target, h, result, piece):

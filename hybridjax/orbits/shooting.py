@@ -6,11 +6,11 @@ end. If a nearby turn was recorded, all its moves are computed side by side from
 the search, to see that it is still right. This needs few calls of compiled functions, instead of
 one call for every step. (Multiple shooting: H. G. Bock and K. J. Plitt, IFAC Proceedings 17, 1984.)
 
-A wrong Newton step comes from `_changes`. A turn that is refused without need comes from
-`_forwards` (a move would end before it starts), from `_searched` (a move fails, or does not lead to
-the chart, the armed guards or the number of events with which the next one begins), or from
-`travel` (gaps). `newton.py`, `curve.py` and `batches.py` call this file, and so do sections that
-follow recorded moves.
+A wrong Newton step comes from `_changes`. If a turn is refused without need, there are three
+places: `_forwards` (a move would have a negative duration), `_searched` (a move fails, or ends in
+another chart or with other armed guards than the next one begins), and `travel` (gaps between
+moves). `newton.py`, `curve.py` and `batches.py` call this file, and so do sections that follow
+recorded moves.
 """
 
 import dataclasses

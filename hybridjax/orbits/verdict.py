@@ -425,8 +425,8 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
 
 
 def _moves_of_visits(event: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " m"]]:
-    """The moves of each visit, up to the one that ends with its event. The first visit may begin
-    before the turn, at negative indices."""
+    """The moves of each visit. The last one ends with the event of the visit. The first visit may
+    begin before the turn, at negative indices."""
     ends = np.flatnonzero(event >= 0)
     if not len(ends):
         return [np.arange(len(event))]
@@ -690,7 +690,8 @@ def _other_multipliers(apart: float) -> list[Finding]:
 
 
 def _unresolved_multipliers(cycle, path: _Path) -> list[Finding]:
-    """A finding on multipliers whose product is not that of the determinants of all moves.
+    """A finding if the product of the multipliers differs from the product of the determinants of
+    all moves.
 
     Each determinant is accurate to nearly all digits. Multipliers lose digits if deviations grow by
     many powers of ten within the period and shrink again, as near a separatrix.

@@ -43,7 +43,7 @@ _FRACTIONS = np.linspace(0.0, 1.0, 9)[1:]
 
 
 class Stretch(NamedTuple):
-    """L pieces of flow without events, each in its chart."""
+    """L pieces of flow without events. Each piece lies in one chart."""
 
     t: Float[np.ndarray, " L"]
     """Times at which they begin."""

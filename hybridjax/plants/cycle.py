@@ -76,7 +76,7 @@ class PlantCycle(Showable):
     - `plant`, `sections`, `inputs`, `outputs`.
     - `period`: mean duration of a cycle.
     - `cycle_outputs` (N, ny): mean outputs at the sections.
-    - `state`: that of the plant on section 0, if it can be set.
+    - `state`: state of the plant on section 0, if it can be set.
     """
 
     plant: Plant
@@ -415,7 +415,8 @@ def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> N
     first = values[:half].mean(axis=0)
     last = values[-half:].mean(axis=0)
     change = np.abs(first - last)
-    # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
+    # (With a linear trend, `change` is 1.7 standard deviations of the values; with noise over ten
+    # cycles, about 0.6.)
     scatter = 1.6 * values.std(axis=0)
     if (change > np.maximum(1e-4 * size, scatter)).any():
         raise ComputationError(

@@ -122,8 +122,8 @@ class At(NamedTuple):
 
 
 Trial = tuple[list[list[float]], str]
-"""One experiment: signals at the sections and lateness (n, ny + 1), and the cause of its end, "" if
-it ran to its end."""
+"""One experiment: outputs at the sections, with the lateness as a last column (n, ny + 1); and the
+reason why it ended early, "" if it did not."""
 
 
 class Drive:

@@ -103,8 +103,8 @@ class Returns(MultiplierFit):
     **Fields** beside those of all fits of multipliers:
 
     - `coordinates`: names of the numbers that were perturbed.
-    - `travelling`: names of those that grow in each cycle and on which nothing depends, such as the
-      distance walked. Their multipliers are 1 and are not listed.
+    - `travelling`: names of coordinates that grow in each cycle and on which nothing depends, such
+      as the distance walked. Their multipliers are 1 and are not listed.
     - `noise` (d,): standard deviation of each coordinate in returns from nearly equal states.
     - `residual`: largest distance between state and return, in units of the range of the
       coordinate on the cycle.
@@ -375,7 +375,7 @@ class ReturnMap:
 
     def solve(self) -> Float[np.ndarray, " d"]:
         """Move x to the fixed point by Newton's method, as long as the residual falls, and return
-        the residual. A state whose residual is noise stays as it is."""
+        the residual. If the residual is only noise, x does not change."""
         residual = self.residual()
         for _ in range(8):
             allowed = 3 * self.noise / self.size
@@ -561,10 +561,10 @@ class _Eigenvalues(NamedTuple):
 
     value: Complex[np.ndarray, " d"]
     left: Complex[np.ndarray, "d d"]
-    """Left eigenvectors in columns, each with product 1 with the right one."""
+    """Left eigenvectors in columns. The product of each with its right eigenvector is 1."""
     right: Complex[np.ndarray, "d d"]
     variance: Float[np.ndarray, "d d"]
-    """Variance of each eigenvalue by the noise of each column."""
+    """Variance of each eigenvalue (rows) that the noise of each column of the Jacobian causes."""
     apart: Complex[np.ndarray, " d"]
     """Difference of each between narrow and wide steps; 0 if the difference may be noise."""
     error: Float[np.ndarray, " d"]
@@ -676,7 +676,8 @@ def _degrees(
 ) -> float:
     """Return the smallest number of degrees of freedom of the errors (Satterthwaite 1946).
 
-    **Arguments:** `variance`: noise of each multiplier by column, each with `own` degrees.
+    **Arguments:** `variance`: variance of each multiplier by the noise of each column. `own`:
+    degrees of freedom of the noise of one column.
     """
     degrees = [np.inf]
     for parts, total in zip(variance, error**2, strict=True):

@@ -41,8 +41,8 @@ class SectionData(Showable, eqx.Module):
 
     - `records`: `SectionSeries` for `fit_series`, `validate`, ...: one for each uninterrupted
       stretch. Samples in gaps are NaN, so that no equation reaches across one.
-    - `times`: for each record, the times at its sections. `trials`: for each, the index of its
-      trial.
+    - `times`: for each record, the times at its sections. `trials`: for each record, the index of
+      its trial.
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
     - `period`: the median. `bandwidth`: bandwidth of the splines through the outputs, in Hz.
     - `spikes`: for each signal (inputs, then outputs), the number of samples left out as spikes.

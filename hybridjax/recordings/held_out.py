@@ -78,8 +78,8 @@ class Split(NamedTuple):
     late: list[SectionSeries]
 
     def best_order(self, most: int = 4) -> tuple[int, str]:
-        """Choose an order; see `select_order`. Return it and, if it is the largest that could be
-        tried, the obstacle to a larger one."""
+        """Choose an order; see `select_order`. Return the order; and, if it is the largest that
+        could be tried, the reason why larger ones could not be tried."""
         compared, obstacle = self.compare_orders(most)
         return compared.order, obstacle
 

@@ -341,7 +341,7 @@ def _first_that_agrees(data: SectionData) -> NaturalMultipliers:
 
 
 def _is_of_events_alone(data: SectionData, phase: Phase) -> bool:
-    """Return whether one input acts on a rhythm of which only the times of events are known."""
+    """Return whether the data are one input and the times of events, without other outputs."""
     stretches = itertools.chain.from_iterable(phase.stretches)
     of_events = all(stretch.linear for stretch in stretches)
     return data.outputs == ("duration",) and len(data.inputs) == 1 and of_events

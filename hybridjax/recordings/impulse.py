@@ -242,7 +242,8 @@ def _durations(data: SectionData) -> Series:
 
 
 def _smeared(h: np.ndarray, push: Series) -> np.ndarray:
-    """Return responses to a push of several sections, from those to one; lags come first."""
+    """Return responses to a push that lasts for several sections, from responses to a push of one
+    section. The first axis has the lags."""
     return np.asarray(ndimage.correlate1d(h, push, axis=0, mode="constant"))
 
 

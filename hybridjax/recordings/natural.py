@@ -417,7 +417,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
         )
 
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
-        """Return the outputs of so many sections, the last one `shift` before the state."""
+        """Return the outputs at `count` sections, the last of which is `shift` sections before the
+        state."""
         return np.array(
             [
                 (data.records[s].y[k - shift - np.arange(count)] / size).ravel()
@@ -461,7 +462,7 @@ def _rows(data: SectionData) -> Int[np.ndarray, "rows 4"]:
     """Return record, cycle, section and sample of all states that have instruments before them and
     a next state."""
     N = data.n_sections
-    before = 3 * _EACH  # (of instruments there is one section more)
+    before = 3 * _EACH  # (instruments need one section more)
     rows = [np.zeros((0, 4), int)]
     for s, record in enumerate(data.records):
         sample = np.arange(before, len(record.y) - N)
@@ -580,8 +581,8 @@ def _resampled(
     block: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "B K"]:
-    """Draw blocks of each record, or whole records, and return how often each cycle is in each
-    draw."""
+    """Draw blocks of each record (or whole records) with replacement. Return how often each cycle
+    occurs in each draw."""
     names, place, counts = np.unique(records, return_inverse=True, return_counts=True)
     weights = np.zeros((_DRAWS, len(records)))
     if block == counts.max():

@@ -165,7 +165,8 @@ class Phase(Showable, eqx.Module):
 
     @property
     def jitter(self) -> float:
-        """Relative standard deviation of the periods of each trial about their line."""
+        """Relative standard deviation of the periods about a straight line through the periods of
+        each trial."""
         residuals = [signal.detrend(p) for p in self.periods if len(p) > 2]
         dof = sum(len(x) - 2 for x in residuals)
         square = sum(x @ x for x in residuals) / max(dof, 1)

@@ -38,8 +38,9 @@ PhaseDefinition: TypeAlias = KinematicPhase | Crossing | AtEvent
 # The rhythm of a trial is estimated from the trial alone if it has this many intervals. More: long
 # trials are judged by the period of other trials. Fewer: it is estimated from too few intervals.
 _ENOUGH = 20
-# Long intervals are part of the rhythm if they are more than this part of all intervals. Larger:
-# rhythms of long and short cycles are cut at each long one. Smaller: missed events pass for cycles.
+# Long intervals are part of the rhythm if they are more than this part of all intervals. Larger: in
+# rhythms of long and short cycles, each long cycle counts as a missed event. Smaller: missed events
+# pass for cycles.
 _COMMON = 0.1
 # A signal is a switch if it jumps by this part of its range, and if this part of its samples is at
 # its two values. Larger: noisy triggers are smoothed, and lost. Smaller: waves (41 %) are not
@@ -128,7 +129,7 @@ def _from_crossings(
 
 def _is_switched(recording: Recording, crossing: Crossing, name: str) -> bool:
     """Return whether a signal stays at two values and jumps at its marked crossings, like the
-    signal of a trigger. Smoothing would move its crossings, or remove them with its pulses."""
+    signal of a trigger. Smoothing would move the crossings, or remove short pulses."""
     shares = []
     at_two_values = []
     for trial, x in recording.samples(signal_of(crossing)):
@@ -390,8 +391,9 @@ class _Rhythm(NamedTuple):
 def _rhythm(intervals: Series) -> _Rhythm:
     """Return the rhythm of a trial.
 
-    Irregular rhythms have intervals of all lengths: the limits lie at the first gap in their
-    distribution on either side of the median (0.25 periods above, 0.1 below).
+    Irregular rhythms have intervals of many lengths. The limits therefore lie at the first gap in
+    the distribution of intervals on either side of the median. (A gap is 0.25 periods wide above
+    the median, and 0.1 below.)
     """
     period = _period(intervals)
     length = np.sort(intervals / period)

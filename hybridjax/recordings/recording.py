@@ -207,7 +207,7 @@ class Recording(Showable, eqx.Module):
 
     @staticmethod
     def beside(recordings: Iterable["Recording"]) -> "Recording":
-        """Combine signals that were recorded side by side, each with times of its own.
+        """Combine signals that were recorded at the same time, each with its own sampling times.
 
         All share one time axis, on which a signal is missing (NaN) where it was not sampled:
         nothing is interpolated. Trials of the same position belong together; their times must count
@@ -432,8 +432,8 @@ def _require_increasing(where: str, time: Series) -> None:
 
 
 def _begins_again(time: Series, bad: int) -> bool:
-    """Return whether time falls at sample `bad` by more than half of its range so far, and goes on
-    from there."""
+    """Return whether time begins again at sample `bad`: it falls by more than half of its range so
+    far, and increases afterwards."""
     so_far = np.ptp(time[:bad])
     after = time[bad : bad + 3]
     rises = bool((np.diff(after) > 0).all())

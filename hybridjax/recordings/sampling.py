@@ -325,7 +325,8 @@ def _without_spikes(
 
 
 def _counted_through(stretches: Sequence[Winding]) -> tuple[Series, Series]:
-    """Return times and phases of all stretches of a trial, each of which begins in a new cycle."""
+    """Return times and phases of all stretches of a trial, counted on such that each stretch begins
+    in a new cycle."""
     times = [np.zeros(0)]
     phases = [np.zeros(0)]
     cycle = 0.0
@@ -503,8 +504,8 @@ def _after_clock(
     times: list[Series],
     plan: _Plan,
 ) -> list[Series]:
-    """Return times minus those of the clock: a line through the times of each section,
-    t = T cycle + a[section], all with the same slope T. Cycles are counted through gaps."""
+    """Return the deviations of times from those of an even rhythm, t = T cycle + a[section], with
+    one period T for all sections. Cycles are counted across gaps."""
     N = plan.n_sections
     first = parts[0]
     begin = first.t[0] / plan.period - first.k[0] / N

@@ -61,10 +61,10 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     r"""Return a natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
-    *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): the minimizer of
-    $\sum (y_i - f(t_i))^2 + \gamma \int f''^2$ passes a sine of frequency $f$ with the gain
-    $1 / (1 + \gamma h (2 \pi f)^4)$, h the time between samples, and $\gamma$ is chosen so that
-    this is one half at b.
+    *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): it minimizes $\sum
+    (y_i - s(t_i))^2 + \gamma \int s''^2$ over functions s. A sine of frequency $f$ passes with the
+    gain $1 / (1 + \gamma h (2 \pi f)^4)$, where h is the time between samples, and $\gamma$ is
+    chosen so that the gain is one half at b.
     """
     finite = np.isfinite(values)
     count = int(finite.sum())
@@ -122,8 +122,8 @@ def bridgeable(time: Series, longest: int | float = 0.0) -> float:
 
 
 def gaps(time: Series, longest: int | float) -> Float[np.ndarray, "g 2"]:
-    """Return the intervals without samples that are longer than `longest`, from the one before all
-    samples, which starts at -inf, to the one after them."""
+    """Return the intervals without samples that are longer than `longest`, including the interval
+    before all samples, which starts at -inf, and the one after all samples."""
     edges = np.concatenate([[-np.inf], time, [np.inf]])
     intervals = sliding_window_view(edges, 2)
     return intervals[np.diff(edges) > longest]
@@ -248,8 +248,8 @@ def recurring(
 
 
 def input_spikes(values: Series) -> Series:
-    """Return `spike_heights` of an input, only where it is smooth otherwise and a spike lies far
-    beyond its usual range: the perturbation itself must stay."""
+    """Return `spike_heights` of an input, but only if the input is smooth otherwise, and only of
+    spikes far beyond its usual range. (The perturbation itself must not be removed.)"""
     heights = spike_heights(values)
     if not heights.any():
         return heights

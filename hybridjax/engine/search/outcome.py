@@ -366,7 +366,7 @@ def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
 def _expected(
     sequence: tuple[int, ...] | None, events: Index, fired: Index
 ) -> Bool[Array, " L"]:
-    """Test whether the next event of each lane is that of the limit cycle."""
+    """Test whether the next event of each lane is the one that follows on the limit cycle."""
     xp = namespace(fired)
     if not sequence:
         return xp.full(fired.shape, sequence is None)

@@ -54,9 +54,10 @@ def search(
     result: Index,
     options: Options,
 ) -> Recorded:
-    """Flow every lane to its target, or to a result code for the reason of its failure.
+    """Flow every lane to its target. A lane that fails stays where it failed, and has a result
+    code.
 
-    Lanes whose `result` is not OK at the start stay there.
+    Lanes whose `result` is not OK at the start do not move.
     """
     task = Task(
         s, u, target, target.limit - lanes.t, stride, settings, options.tangents

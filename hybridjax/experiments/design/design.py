@@ -445,8 +445,8 @@ def _count(number: int | str, noun: str) -> str:
 def require_inputs(
     design: Design, other: str, n_sections: int, inputs: tuple[str, ...]
 ) -> None:
-    """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a name
-    of one input is that of another one there."""
+    """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or if the
+    inputs have the same names in another order."""
     what = f"design and {other}"
     names = design.inputs
     require_equal(what, "n_sections", design.n_sections, n_sections)

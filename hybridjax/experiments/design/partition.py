@@ -82,7 +82,8 @@ def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
 
 
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
-    """Return the exact minimum of experiments for these lines, repeated ones counted each time."""
+    """Return the smallest possible number of experiments for these lines. (A repeated line counts
+    each time.)"""
     return int(np.bincount(line_class(line, periods)).max())
 
 
@@ -244,7 +245,7 @@ class _Division:
 
 
 def _products(periods: int) -> list[list[int]]:
-    """Return for each pair of classes a bit mask of the classes of its second-order products."""
+    """Return, for each pair of classes, the classes of its second-order products as a bit mask."""
     top = periods // 2 + 1
 
     def fold(x):
@@ -260,7 +261,7 @@ def _products(periods: int) -> list[list[int]]:
 
 
 def _hits(classes: list[int], products: list[list[int]]) -> int:
-    """Return the number of second-order products of some classes that fall on one of them."""
+    """Return how many second-order products of lines of these classes fall on one of the lines."""
     mask = sum(1 << c for c in classes)  # (an experiment has each class once)
     pairs = itertools.combinations_with_replacement(classes, 2)
     return sum((products[a][b] & mask).bit_count() for a, b in pairs)

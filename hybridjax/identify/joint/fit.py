@@ -604,7 +604,7 @@ def _require_answer(point: ModelPoint) -> None:
 def _surplus(
     fit: LDTPFit, point: ModelPoint, smaller: Callable[[Sequence[int]], PeriodicModel]
 ) -> list[Finding]:
-    """Return a finding if a model with one dimension less at each section is nearly as good, or
+    """Return a finding if a model with one dimension less at each section is nearly as good, or if
     the data do not determine the multipliers.
 
     **Arguments:** `smaller`: a first model with these dimensions.

@@ -1,4 +1,4 @@
-"""Multipliers by one regression of outputs on those of earlier cycles, without iteration.
+"""Multipliers by one regression of outputs on the outputs of earlier cycles, without iteration.
 
 By the theorem of Cayley and Hamilton, outputs of successive cycles at one section, less what inputs
 explain, obey the characteristic polynomial of the multipliers: a sum of the outputs of d + 1

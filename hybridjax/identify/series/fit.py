@@ -541,7 +541,7 @@ def missing_cycles(
 ) -> int:
     """Return about how many more cycles are needed for this number of degrees of freedom."""
     n, i = np.unravel_index(np.argmin(solution.dof), solution.dof.shape)
-    # (More lags than samples would use up more of them.)
+    # (If `dof` is 0, there may be fewer samples than unknowns: `freedom_left` may be negative.)
     left = int(solution.dof[n, i]) or problem.freedom_left(int(n), int(i))
     return max(least - left, 0)
 
@@ -647,11 +647,11 @@ class BlockScores(NamedTuple):
         return Covariance(matrix, denominator.block_freedom(self.scaled, self.share))
 
     def trend(self) -> float:
-        """Return the p-value of coefficients that do not change linearly in time.
+        """Return the p-value of the hypothesis that coefficients do not change linearly in time.
 
-        A score test: if they change, scores of earlier and later blocks differ. Their sum, weighted
-        by the time, is compared with its squares (Hotelling's T; for constancy of parameters:
-        Nyblom, J. Amer. Stat. Assoc. 84, 1989).
+        A score test: if coefficients change, scores of earlier and later blocks differ. The test
+        statistic is the sum of the scores times the time of their block, relative to its covariance
+        (Hotelling's T; for constancy of parameters: Nyblom, J. Amer. Stat. Assoc. 84, 1989).
         """
         blocks, d = self.scaled.shape
         if blocks < d + _FEWEST_BLOCKS:
@@ -753,7 +753,8 @@ def _block_sums(
     **Arguments:** `x`: columns for each output, the first measured. `memory`: c, fading.
     """
 
-    def backward(x):  # its product with white noise is that of x with filtered noise
+    # (backward(x) times white noise equals x times filtered noise)
+    def backward(x):
         return divide_by_chi(memory, (sampled * x)[:, ::-1])
 
     rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)

@@ -83,7 +83,7 @@ class SectionEquations(NamedTuple):
     numerators: Float[np.ndarray, "columns ny d1"]
     """The coefficients of these parts."""
     root: Float[np.ndarray, "columns r"]
-    """root @ root.T is their covariance, for noise of variance one."""
+    """A root of the covariance of these coefficients, root @ root.T, for noise of variance one."""
     taken: tuple[Float[np.ndarray, "rows r"], Float[np.ndarray, "rows r"]]
     """The first matrix, times the transposed second one, maps errors to the part of them that
     numerators fit."""
@@ -105,8 +105,8 @@ class Solution(NamedTuple):
 def best_order(
     data: RecordedData, references: Sequence[str], most: int
 ) -> tuple[int, str]:
-    """Return the largest number of multipliers, up to `most`, that the references determine, and
-    the obstacle to a larger number, if there was one."""
+    """Return the largest number of multipliers, up to `most`, that the references determine; and
+    the reason why a larger number cannot be tried, if there is one."""
     obstacle = ""
     for order in range(most, 1, -1):
         # (Too few cycles for this order: the text becomes a finding.)
@@ -302,7 +302,7 @@ class LoopEquations:
     ) -> Float[np.ndarray, "B d"]:
         """Return the sums of errors times instruments over blocks of cycles.
 
-        The errors of a block are those of numerators that are fitted to the other blocks."""
+        The errors of a block are those with numerators that are fitted to the other blocks."""
 
         def blocks(x: np.ndarray) -> np.ndarray:
             grid_shape = self.grid.y.shape[:2]

@@ -155,7 +155,8 @@ def measured_outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T 
 def sum_up(
     problem: OutputErrorProblem, c: Coefficients, outputs: Outputs, regress: Regress
 ) -> list[list[SectionFit]]:
-    """Return the fits of each section, with one regression for each list of outputs."""
+    """Return the fits of each section. Each list of outputs with equal weights is one
+    regression."""
     parts = problem.parts()
 
     def section(n: int) -> list[SectionFit]:

@@ -45,7 +45,8 @@ class SeriesPart(NamedTuple):
     first: Int[np.ndarray, " R"]
     """The section at which each record starts."""
     drift: Float[np.ndarray, "N R T ny K"]
-    """An orthonormal basis of the drift of the samples of each output, zero beyond its rank."""
+    """An orthonormal basis of the drift of each output at its samples; columns beyond its rank are
+    zero."""
 
     @classmethod
     def of(cls, grid: CycleGrid, scale: Float[np.ndarray, " ny"]) -> "SeriesPart":
@@ -470,7 +471,7 @@ class Predictor(NamedTuple):
     def predicted(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
-        """Return the outputs expected at each sample, given the samples before it."""
+        """Return the expected outputs at each sample, given all earlier samples."""
         ones = np.ones(self.S.shape[1])
         part = SeriesPart.of(grid, ones)
         problem = SeriesProblem(

@@ -124,9 +124,9 @@ class PreparedRecords:
     """Records as grids of similar lengths.
 
     **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
-    `SectionSeries`; `about`: by name. `grids`: the grids. `begins`: for each grid (S,) the cycles
-    of all records before each of its own. `cycles`: number of cycles of the longest record.
-    `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
+    `SectionSeries`; `about`: by name. `grids`: the grids. `begins`: for each grid, (S,): the number
+    of cycles of all records before each record of the grid. `cycles`: number of cycles of the
+    longest record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
 
     **Arguments:** `free_start`: whether the states at the starts are unknown. Records with drift
     are then cut into pieces, each with its own start and drift, because the time of a fit grows

@@ -139,8 +139,8 @@ def independence_test(
 
     **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
     in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
-    makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
-    degrees of freedom of all sections, which is 1 to 4 % too optimistic.
+    makes F ratios of n samples noncentral, by $n r^2$. The power is computed for one F ratio with
+    the degrees of freedom of all sections, and is 1 to 4 % too large.
     """
     S, T, N, ny = error.shape
     z = np.zeros((N, lags, ny, u.shape[3]))
@@ -240,8 +240,8 @@ def about_misfit(
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled. `innovations`: whether the fit has process noise.
-    `direct`: whether it has a D. Without one, inputs at the section of a residual are no cause of
-    it: a controller may have made them of the output.
+    `direct`: whether it has a D. Without D, inputs at the section of a residual are left out, since
+    a controller may have made them from the output.
     """
     S, T, N, ny = error.shape
     is_late = (grid.age > N)[..., None]

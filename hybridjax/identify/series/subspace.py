@@ -39,7 +39,7 @@ def subspace_model(
 ) -> PeriodicModel:
     """Return a model with these dimensions, with or without K and D.
 
-    Each output is regressed on its past and that of the inputs, section by section. The matrix from
+    Section by section, each output is regressed on past outputs and past inputs. The matrix from
     the past of a section to the outputs from this section on has a rank that is the dimension of
     the state (Chiuso 2007, "PBSID", for each section of the period). Samples before a record count
     as zero: many short records that begin anywhere give a worse model.

@@ -2,12 +2,12 @@ r"""Errors of intervals between events: jitter of each interval, and a rate that
 
 The phase at the end of an interval of duration T has the variance $s^2 w T$ (the jitter), where w
 is the rate. The duration has this variance divided by the square of the rate at which the phase
-reaches 1. The rate $w + e$ of an interval may differ from that of its trial, by a stationary
-process with $\mathrm{cov}(e_j, e_k) = \sigma^2 e^{-|t_j - t_k|/\theta}$: an autoregression of order
-1 for evenly spaced intervals, independent for $\theta = 0$, and a random walk if $\theta$ is longer
-than the trial. Its parameters maximize the restricted likelihood (Patterson and Thompson 1971),
-which a Kalman filter evaluates (Harvey, *Forecasting, Structural Time Series Models and the Kalman
-Filter*, 1989).
+reaches 1. The rate $w + e$ of an interval may differ from the rate w of its trial. The difference e
+is a stationary process with $\mathrm{cov}(e_j, e_k) = \sigma^2 e^{-|t_j - t_k|/\theta}$: an
+autoregression of order 1 for evenly spaced intervals, independent for $\theta = 0$, and a random
+walk if $\theta$ is longer than the trial. Its parameters maximize the restricted likelihood
+(Patterson and Thompson 1971), which a Kalman filter evaluates (Harvey, *Forecasting, Structural
+Time Series Models and the Kalman Filter*, 1989).
 
 `estimation.py` calls `estimate_wander` with residuals of durations, and `whitening` to make errors
 independent (`Whitening`). A wrong standard error of a curve under slow inputs has its cause in
@@ -220,7 +220,7 @@ def estimate_wander(
 
 
 class WithoutRates(NamedTuple):
-    """Columns of independent errors without what the rates of the trials explain of them."""
+    """Columns of independent errors, without the part that changes of the trials' rates explain."""
 
     rest: Columns
     along: Float[np.ndarray, "trials c"]

@@ -129,7 +129,7 @@ class CurveFit(NamedTuple):
 
     @property
     def missed(self) -> Lanes:
-        """By how many cycles each interval misses its forecast."""
+        """Error of the forecast of each interval, in cycles."""
         return self.residual * self.forecast.rate
 
     def counted(self) -> Bool[np.ndarray, " L"]:
@@ -456,7 +456,7 @@ def _covariance(fit: CurveFit, data: Square, meat: Square) -> Square:
 
 
 def fit_rates(intervals: Intervals, coefficients: Curve, jitter: float) -> CurveFit:
-    """Return the rate of each trial under a known curve, with the durations that both forecast."""
+    """Fit only the rate of each trial, for a known curve."""
     fit = _start(intervals, len(coefficients) - 1, None)
     fit = fit._replace(coefficients=coefficients, jitter=jitter)
     table = tabulated(len(coefficients) - 1, jitter)
@@ -490,11 +490,12 @@ class Carried(NamedTuple):
 
     part: float
     error: float
-    """Standard error; infinite if no two intervals follow each other."""
+    """Standard error; infinite if there are no two successive intervals."""
 
 
 def follows(intervals: Intervals, fit: CurveFit) -> Bool[np.ndarray, " L1"]:
-    """Return which intervals after the first begin where the one before ends, both used."""
+    """Return, for all intervals but the first, whether the interval begins where the one before
+    ends, and both are used."""
     end = intervals.start + intervals.duration
     pause = np.abs(intervals.start[1:] - end[:-1])
     same = np.diff(intervals.trial) == 0

@@ -66,8 +66,8 @@ class Intervals(NamedTuple):
 
 
 def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
-    """Return the intervals between events, with the input of that name, linear between samples,
-    without its mean in each trial.
+    """Return the intervals between events, with the input of that name. The input is linear between
+    samples, and its mean in each trial is subtracted.
 
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
@@ -116,7 +116,8 @@ def _of_trial(
     stretches: Sequence[Winding],
     number: int,
 ) -> Intervals | None:
-    """Return the intervals of a trial during which its input x was sampled, if there are any."""
+    """Return those intervals of a trial during which its input x was sampled; None if there are
+    none."""
     nothing = np.zeros(0)
     starts = [w.time[:-1] for w in stretches]
     durations = [np.diff(w.time) for w in stretches]
@@ -348,10 +349,11 @@ def _end(
     last: Lanes,
     own: Lanes,
 ) -> tuple[Lanes, Lanes]:
-    """Return the part of a step at whose end the phase is 1, and the rate there per step.
+    """Return the part of a step after which the phase is 1, and the rate of the phase at this point
+    (per step).
 
-    It is the root of the cubic with the given phases and rates (per step) at both ends of the step.
-    Beyond the step, the phase grows at its `own` rate.
+    The part is the root of the cubic through the given phases and rates (per step) at both ends of
+    the step. Beyond the step, the phase grows at its `own` rate.
     """
     rise = after - before
     cubic = first + last - 2 * rise

@@ -170,8 +170,8 @@ class Wanted(NamedTuple):
         return not _with_groups(name).isdisjoint(_set(self.signals))
 
     def reaches(self, group: str) -> bool:
-        """Return whether a signal, its group, or one of its members is wanted: `imu` is reached by
-        `imu.gyro.x`, and `imu.gyro.x` by `imu`."""
+        """Return whether a signal, a group that contains it, or a member of it is wanted: `imu` is
+        reached if `imu.gyro.x` is wanted, and `imu.gyro.x` if `imu` is wanted."""
         if self.signals is None:
             return True
         within = not _with_groups(group).isdisjoint(_set(self.signals))
@@ -199,8 +199,8 @@ class Wanted(NamedTuple):
 
 
 def _with_groups(name: str) -> set[str]:
-    """The name of a signal, and those of the groups that it is in: `imu.gyro.x`, `imu.gyro` and
-    `imu`."""
+    """The name of a signal, and the names of the groups that contain it: `imu.gyro.x`, `imu.gyro`
+    and `imu`."""
     groups = {name[:k] for k, letter in enumerate(name) if letter in "./"}
     return {name, *groups}
 

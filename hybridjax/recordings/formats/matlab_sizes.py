@@ -152,7 +152,8 @@ def declared(path: Path) -> Iterator[int]:
 
 
 def _array(path: Path, source: _Reader, size: int, depth: int) -> Iterator[int]:
-    """Yield the sizes of an array, of which the tag has been read, and of its members."""
+    """Yield the sizes of an array and of its members. (The tag of the array has been read
+    already.)"""
     if depth > limits.NESTED:
         raise FileFormatError(
             f"'{path}' has arrays in more than {limits.NESTED} structs or cells: save them in "

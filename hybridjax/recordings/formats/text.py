@@ -24,7 +24,7 @@ from ...errors import FileFormatError
 from .columns import EVENT, Columns, Wanted, assumed, is_unit, split_header, two_columns
 
 
-# Bytes that no text holds, in any encoding with one byte for each ASCII character.
+# Bytes that do not occur in texts, in any encoding with one byte for each ASCII character.
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\v\f\r\x1a\x1b"))
 _COMMENTS = ("#", "%", "//")
 # Marks of a missing sample, in any case of letters.
@@ -243,7 +243,7 @@ def read_table(
 
 
 def _about_texts(headers: Sequence[str], columns: Iterable[int]) -> Finding:
-    """The finding that these columns were left out, as they are texts alone."""
+    """The finding that some columns were left out, since they have texts only."""
     names = ", ".join(f"'{headers[k]}'" for k in columns)
     return assumed(f"columns of text were left out: {names}.")
 

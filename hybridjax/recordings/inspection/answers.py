@@ -57,7 +57,7 @@ class _Part(NamedTuple):
     before: Signals
     """Outputs of the cycle before the predicted one."""
     inputs: list[Signals]
-    """Means of each input over parts of the cycles around the predicted one."""
+    """Means of each input over parts of cycles: of the predicted cycle and its neighbors."""
     outputs: Signals
     """Outputs of the predicted cycle."""
 
@@ -81,10 +81,10 @@ class _Answer(NamedTuple):
 def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
     """Find inputs that the outputs do not answer, in all trials or in parts of them.
 
-    Each cycle is predicted linearly from the one before and from the inputs, as learned from the
-    other trials (or the other parts of a single one). The gain of a part is the ratio of actual to
-    predicted response: about 1, but 0 for the input of another trial, -1 for the other sign.
-    Standard errors come from the residuals, cycle by cycle.
+    Each cycle is predicted linearly from the cycle before and from the inputs. The coefficients are
+    learned from the other trials (or from the other parts of a single trial). The gain of a part is
+    the ratio of actual to predicted response: about 1, but 0 for the input of another trial, -1 for
+    the other sign. Standard errors come from the residuals, cycle by cycle.
 
     **Arguments:** `names`: names of the trials.
     """
@@ -142,8 +142,8 @@ def _odd(
 
 
 def _answers(parts: Sequence[_Part], i: int) -> list[_Answer]:
-    """Return the answers to input i, learned for each part from other trials (or, of a single
-    trial, from its other parts). Too few: none."""
+    """Return the answer to input i in each part. The prediction is learned from other trials, or
+    from other parts of a single trial; without enough of these, the list is empty."""
     regressors = [part.regressors() for part in parts]
     squares = [x.T @ x for x in regressors]
     products = [x.T @ p.outputs for x, p in zip(regressors, parts, strict=True)]
@@ -230,13 +230,13 @@ def _robust_size(data: SectionData) -> Float[np.ndarray, " ny"]:
 
 
 def _centered(x: Signals) -> Signals:
-    """Subtract the means: each part has a level of its own."""
+    """Subtract the means, since the level of a signal may differ between parts."""
     return x - x.mean(axis=0)
 
 
 def inexact_events(data: SectionData) -> Iterator[Finding]:
-    """Find events whose times scatter: outputs after them deviate along the average cycle, by times
-    that do not depend on those of the events before."""
+    """Find events whose times are inexact: outputs after an event are shifted along the average
+    cycle by a time that does not depend on the shifts after earlier events."""
     N = data.n_sections
     size = data.rms()[1]
     tiny = np.finfo(float).tiny

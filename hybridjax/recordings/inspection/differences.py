@@ -22,8 +22,9 @@ from ..sampling import cycle_means
 from ..smoothing import Series
 
 
-# Factor within which ranges of two signals are alike, and a ratio is a power of ten. Larger: other
-# gains are taken for units. Smaller: swapped columns of signals whose range varies pass.
+# Ranges of two signals are alike if their ratio is below this factor; a ratio is a power of ten if
+# it differs from one by less than this factor. Larger: other gains are taken for units. Smaller:
+# swapped columns of signals whose range varies pass.
 _ALIKE = 1.2
 # A trial has another zero if its offset exceeds this multiple of the offsets of other trials, and a
 # part of the range. Larger: offsets pass. Smaller: scatter between trials is reported.
@@ -43,8 +44,11 @@ _STRETCH = 8
 # reported.
 _ODD = 12.0
 _ALIKE_PERIODS = 0.05
-# Fewest steps of time from which a grid of stamps is found, most different ones, and the least grid
-# in steps. Larger grid: errors of a fifth of a step pass. Smaller: stamps in ms are reported.
+# Time stamps are coarse if the times between samples are multiples of a *grid* (the resolution of
+# the clock). This is tested with at least `_STAMPS` samples, of which at most `_MOST_STEPS`
+# different times between samples exist, and if the grid is at least the part `_COARSE` of the usual
+# time between samples. Larger part: errors of a fifth of this time pass. Smaller: stamps in ms are
+# reported.
 _STAMPS = 50
 _MOST_STEPS = 6
 _COARSE = 0.2
@@ -52,8 +56,9 @@ _COARSE = 0.2
 # changes its sign from cycle to cycle. Larger: alternating steps pass. Smaller: multipliers of -0.9
 # are reported in short recordings.
 _ALTERNATING = 0.5
-# Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
-# that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
+# The means over cycles are decomposed into `_COSINES` cosines over a trial. An output drifts if the
+# mean power of the slowest quarter of these exceeds `_RATIO` times that of the others. Larger:
+# drift passes. A ratio below 14: a multiplier of 0.9 is reported.
 _COSINES = 24
 _RATIO = 20.0
 
@@ -190,13 +195,13 @@ def coarse_stamps(recording: Recording, names: Sequence[str]) -> Iterator[Findin
 
 
 def _grid_of(step: Series) -> float | None:
-    """Return the number of which all steps between samples are multiples, if they differ by it and
-    it is a large part of them."""
+    """Return the grid of which all times between samples are multiples; None if there is none, or
+    if it is much smaller than these times."""
     if len(step) < _STAMPS:
         return None
     usual = float(np.median(step))
     differing = np.abs(step / usual - 1) > _COARSE / 2
-    # Single steps are lost samples.
+    # (A few long steps are lost samples.)
     if differing.mean() < _COARSE / 2:
         return None
     ascending = np.sort(step)
@@ -268,7 +273,8 @@ def alternating_cycles(
 
 
 def _alternating(parts: Sequence[Cycles]) -> float:
-    """Return the part of the variance between cycles that changes its sign from one to the next.
+    """Return the part of the variance between cycles that changes its sign from each cycle to the
+    next.
 
     **Arguments:** `parts`: values of successive cycles, a row for each, without a gap.
     """
@@ -344,7 +350,7 @@ def _difference(
     name: str,
     outputs: Sequence[str],
 ) -> Iterator[Finding]:
-    """Find the cause of a low correlation of the average cycles of a trial with those of others."""
+    """Find the reason why the average cycles of a trial differ from those of other trials."""
 
     def correlations(x: Cycles) -> Float[np.ndarray, " k"]:
         squares = (x**2).sum(axis=1) * (usual**2).sum(axis=1)
@@ -415,8 +421,8 @@ def slow_changes(
     outputs: tuple[str, ...],
     removed: float,
 ) -> Iterator[Finding]:
-    """Find means over cycles that change much more slowly than they scatter, where changes slower
-    than some cycles have been `removed`."""
+    """Find outputs whose means over cycles change slowly, by much more than they scatter.
+    `removed`: number of cycles; changes slower than this have been removed already."""
     for name in outputs:
         power = np.zeros(_COSINES)
         for trial, x, parts in phase.samples(recording, name):

@@ -65,7 +65,7 @@ def _is_placeholder(size: float) -> bool:
 
 
 def frozen(x: Series, period: float, is_input: bool) -> Rows:
-    """Find a sensor that stays at one value for longer than its rhythm allows.
+    """Find samples at which a sensor stays at one value for longer than the rhythm allows.
 
     `period`: rough duration of a cycle, in samples. Inputs may rest at zero, and inputs that rest
     in most cycles are held.
@@ -179,8 +179,8 @@ def repeated_rows(
 ) -> tuple[list[Rows], list[Finding]]:
     """Return for each trial the samples that an earlier trial holds already.
 
-    Windows of successive samples are compared first. If most of those that two trials share are at
-    the same distance, both trials are compared sample by sample.
+    Windows of successive samples are compared first. If two trials share windows, most of them at
+    the same distance in time, the two are compared sample by sample.
     """
     columns = [recording.column(name) for name in names]
     trials = recording.trials
@@ -221,7 +221,8 @@ def _keys(values: Samples) -> Float[np.ndarray, " m"]:
 
 
 def _shift(x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> int | None:
-    """Return the distance at which two trials share most of their common windows, if they do."""
+    """Return the distance (in samples) at which two trials share most of their common windows; None
+    if there is none."""
     _, first, second = np.intersect1d(x, y, return_indices=True)
     if not len(first):
         return None

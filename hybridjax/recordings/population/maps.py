@@ -1,8 +1,9 @@
 """`PopulationMaps`: curves and maps of several subjects, their mean, and tests of differences.
 
-If there is no difference, the largest |t| over a map has the distribution of the largest |t| of
-maps that are drawn from the measured ones. Its quantiles give p-values and bands that hold the
-family-wise error at each point (Nichols and Holmes, Human Brain Mapping 15, 2002). The draws are
+The tests use the largest |t| over a map. If there is no difference, its distribution is that of the
+largest |t| over maps that are drawn from the measured ones. The quantiles of this distribution give
+p-values for each point, and bands, with a family-wise error over all points (Nichols and Holmes,
+Human Brain Mapping 15, 2002). The draws are
 
 - sign flips of paired differences, which are symmetric if there is no difference (exact), and of
   deviations from a mean;
@@ -285,7 +286,7 @@ def _of_groups(
     if _are_skewed(deviations, _SKEWED_GROUPS, rng):
         kind = "subjects within groups (values are skewed, or subjects many)"
         return _resampled(deviations, draws, rng), f"{draws} random draws of {kind}"
-    # The common mean, by the precision of both at each point.
+    # The common mean of both groups, weighted by their precision at each point.
     precisions = []
     for y, deviation in zip(flat, deviations, strict=True):
         squares = np.sum(np.abs(deviation) ** 2, axis=0)
@@ -392,9 +393,9 @@ def _least(y: Maps) -> Float[np.ndarray, " V"]:
 
 
 def moments(parts: list[Maps], weights: list[Weights], drawn: bool = False):
-    """Return the mean of one part, or the difference of the means of two, with standard error and t
-    for each draw (P, V). For two parts, t is Welch's. For complex maps, |t| is the square root of
-    the F ratio of a complex mean.
+    """Return the mean of one part, or the difference between the means of two parts; with standard
+    errors and t for each draw (P, V). For two parts, t is Welch's. For complex maps, |t| is the
+    square root of the F ratio of a complex mean.
 
     **Arguments:** `weights`: weights of the subjects in the mean. `drawn`: whether weights are
     numbers of times that subjects were drawn; otherwise weights keep the sum of squares.

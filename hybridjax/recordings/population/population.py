@@ -57,9 +57,9 @@ class Population(Showable):
     - `values`, `errors`: mappings from the name of a quantity to its estimates, and to their
       standard errors: one for each row, NaN where it is missing.
     - `units`: mapping from the name of a quantity to its unit. Default: none.
-    - `dof`: degrees of freedom of the errors, one number for each row. Where they are few, errors
-      are drawn towards those of the other subjects (Smyth 2004); if there is a column `strides`,
-      towards their trend over the strides. Default: infinite.
+    - `dof`: degrees of freedom of the errors, one number for each row. If they are few, errors are
+      shrunken towards those of the other subjects (Smyth 2004); with a column `strides`, towards
+      their trend over the strides. Default: infinite.
 
     **Raises:** `DefinitionError` for a table without subjects, columns of different lengths, a
     subject in two groups, errors that are not positive, and if pandas is not installed.
@@ -476,8 +476,10 @@ class Population(Showable):
         return cells.items()
 
     def _contrast(self, quantity: str, a: str, b: str, covariates: Sequence[str] = ()):
-        """Return the estimates in two conditions or groups, the numbers and the weights of their
-        cells, and the differences of subjects that have all."""
+        """Prepare the difference a - b of two conditions or groups. Returns a frame with the
+        estimates of subjects; for each of its rows, the number of its cell (group and condition);
+        the weight of each cell in the difference; and the differences of those subjects that have
+        estimates in all cells."""
         factor, rows = rows_with(self.table, a, b)
         data = self._merged(quantity, covariates, rows)
         require(dict(list(data.groupby("cell")["subject"])), 2)

@@ -48,8 +48,9 @@ class Mixed(NamedTuple):
     """Degrees of freedom of a t test: number of subjects less number of coefficients."""
 
     def contrast(self, w: Float[np.ndarray, " p"]) -> tuple[float, float, float]:
-        """Return value, standard error and degrees of freedom of a contrast (of a single one, those
-        of Kenward and Roger are Satterthwaite's), at most those of a t test."""
+        """Return value, standard error and degrees of freedom of a contrast. (For a single
+        contrast, Kenward and Roger's degrees of freedom are Satterthwaite's.) They are at most
+        those of a t test."""
         value = float(w @ self.coefficients)
         error = float(np.sqrt(w @ self.covariance @ w))
         slope = np.einsum("i,kij,j->k", w, self.slopes, w)
@@ -70,7 +71,8 @@ def mixed(
 
     Psi is free between cells that some subject shares, and zero between others (Welch's case).
     """
-    # Whether two estimates are of one subject, (N, N), and which cell each is in, (N, q).
+    # Matrices: whether two estimates belong to one subject, (N, N); and to which cell each estimate
+    # belongs, (N, q).
     same = subjects[:, None] == subjects
     cell = np.eye(cells.max() + 1)[cells]
     # The elements of a lower triangular factor of Psi that are not zero.
@@ -83,8 +85,9 @@ def mixed(
     v = v / square
 
     def squares(free):
-        """Return a factor of Psi and, for generalized least squares, the covariance of the
-        estimates, that of the coefficients, their weights, and the projection to residuals."""
+        """Return a factor of Psi; and for generalized least squares, the covariance of the
+        estimates, the covariance of the coefficients, the weights of the estimates, and the
+        projection to residuals."""
         lower = np.zeros((cell.shape[1], cell.shape[1]))
         lower[row, column] = free
         between = cell @ lower @ lower.T @ cell.T
@@ -148,8 +151,9 @@ def mixed(
 
 def meta(y: Reals, v: Reals, x: Design) -> Mixed:
     """Return the fit of single estimates of subjects, with the covariance of Hartung and Knapp
-    (2001; Knapp and Hartung 2003), scaled by the weighted residuals, but not below one: estimates
-    that scatter less than their errors would have none."""
+    (2001; Knapp and Hartung 2003), scaled by the weighted residuals. The factor is at least one:
+    otherwise estimates that happen to scatter less than their errors would have errors that are too
+    small."""
     each = np.arange(len(y))
     fit = mixed(y, v, x, each, np.zeros(len(y), int))
     variance = v + fit.between[0, 0]

@@ -65,7 +65,8 @@ def cells_of(table: Any) -> Any:
 
 
 def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
-    """Return the factor to which different labels belong, and whether a row has one of them.
+    """Return the factor (group or condition) to which the labels belong, and for each row whether
+    it has one of the labels.
 
     **Raises:** `DefinitionError` if no factor has all of them.
     """
