@@ -46,7 +46,7 @@ def lead_of(table: dict, owners: Iterable[str], name: str) -> str | None:
 
 
 def synonyms(name: str) -> tuple[str, ...]:
-    """Return the words of this package for a word of others, the best one first."""
+    """Return the words of this package for a word of other libraries, the best one first."""
     return _all_words().get(name) or _plain_words().get(plain(name), ())
 
 
@@ -60,7 +60,7 @@ def parts(name: str) -> Iterator[str]:
 
 
 def with_part(part: str, among: Iterable[str]) -> str | None:
-    """Return the first name of which this is a part, or another word for the same."""
+    """Return the first name that contains this word, or another word for the same thing."""
     by_part: dict[str, str] = {}
     for name in among:
         for word in (name, *parts(name)):
