@@ -17,8 +17,8 @@ from .reading import is_of_package
 
 Value = TypeVar("Value")
 
-# Values that are kept in a call, some 30 for each system. Fewer: systems that take turns are looked
-# at again. More: a branch of thousands of points fills the memory.
+# Values that are kept in a call, some 30 for each system. Fewer: in calls with many systems, each
+# is looked at several times. More: a branch of thousands of points fills the memory.
 _KEPT = 1024
 
 

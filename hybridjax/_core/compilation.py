@@ -37,7 +37,8 @@ from .progress import say_compiling
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
-# Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
+# Programs of either kind that are kept. Fewer: calls that alternate between many systems compile
+# again.
 _KEPT = 1024
 
 

@@ -32,7 +32,8 @@ from .reading import Reading
 
 Thing = TypeVar("Thing")
 
-# Definitions whose digests are kept. Fewer: taking turns with many systems traces them again.
+# Definitions whose digests are kept. Fewer: calls that alternate between many systems trace them
+# again.
 _KEPT = 1024
 # Further traces of a function that may draw random numbers; the function is refused unless all are
 # the same. Fewer: a function that draws one of two numbers is missed more often. More: time.

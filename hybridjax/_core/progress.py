@@ -20,8 +20,8 @@ from .boundary.checked import checked
 
 Item = TypeVar("Item")
 
-# Seconds until the line appears, and between updates. Less: it flickers in short calls. More:
-# nothing is shown for long.
+# Seconds until the line appears, and between updates. Less: the line flickers in short calls. More:
+# long waits without a line.
 _DELAY = 1.0
 _LINE = "{desc}, {elapsed}"
 _COUNTED = "{desc} {bar:20} {elapsed}, {remaining} left"

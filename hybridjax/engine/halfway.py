@@ -22,12 +22,12 @@ from ..systems.solver import Method
 # Below 3: the cubic is as accurate.
 _ORDERS = (5, 4, 3)
 # Conditions of the highest order may be violated by this much. (The default method violates them by
-# 1.1e-4, the cubic by 5e-4.) Higher: weights are as wrong as the cubic. Lower: weights of lower
-# order are taken.
+# 1.1e-4, the cubic by 5e-4.) Higher: weights may be as inaccurate as the cubic. Lower: weights of
+# lower order are used instead.
 _VIOLATED = 2e-4
-# Weight of the conditions of lower orders, relative to those of the highest. Higher: rounding
-# errors. Lower: conditions of lower orders are violated, too, and the error does not vanish with
-# the step.
+# How much more the conditions of lower orders count in the least-squares problem than those of the
+# highest order. Higher: rounding errors. Lower: the conditions of lower orders are violated, too,
+# and the error does not vanish for short steps.
 _FIRST = 1e5
 # Weights of the state are no larger than this. Higher: errors of the stages are larger halfway than
 # those of the cubic (Kvaerno5). Lower: the order of weights is lower.

@@ -11,7 +11,8 @@ The file has three parts: the functions that the engine calls (`field` to `level
 the functions of a single point (`_field` to `_levels`); and *forms*, which turn a function of a
 point into a compiled function of lanes. The forms are `_expanded` (with derivatives), `_ByMethod`
 (in steps), `_Tangent` (along directions, for `Tangents`) and `_BySystem` (for many systems,
-`Systems`). A wrong derivative of every function comes from a form, of one function from its part.
+`Systems`). If derivatives of all functions are wrong, look first at the forms; if those of one
+function are wrong, at its function of a point.
 """
 
 import copy
@@ -298,9 +299,10 @@ class Tangents(Structure):
     """A structure for derivatives in P directions, in which parameters of the system and of
     `levels` change.
 
-    Lanes are complex numbers on the host: the real part is the value, and the imaginary part is the
-    derivative times `TINY`. Inputs are those of `unpushed`. A tree of directions has arrays (P,
-    ...), or `None` for a number that does not change.
+    Each lane has one of the P directions. States and times of a lane are complex: the real part is
+    the value, and the imaginary part is its derivative along the direction, times `TINY`. Inputs
+    have P more rows, which say which direction a lane has (see `pushed`). A tree of directions has
+    arrays (P, ...), or `None` for a number that does not change.
     """
 
     def __init__(
@@ -316,8 +318,9 @@ class Tangents(Structure):
         self.moving = sum(x.reshape(directions, -1).any(axis=1) for x in leaves) > 0
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
-        """Inputs of zero, followed by the direction of each lane. A negative index is no
-        direction."""
+        """Inputs for lanes with these directions: the system's own inputs, all zero, then P rows
+        with a 1 in the row of the lane's direction. (A negative index gives zeros: no
+        direction.)"""
         along = np.arange(self.directions)[:, None] == direction
         still = np.zeros((self.nu, len(direction)))
         return np.concatenate([still, along])
@@ -415,7 +418,9 @@ TINY = np.sqrt(np.finfo(float).tiny)
 
 
 def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
-    """Inputs of lanes of the host without any input."""
+    """Inputs that are zero, for lanes with these indices. For `Tangents`, they say which direction
+    each lane has: lanes take turns, first the 1 + d directions of time and states, then the P of
+    parameters."""
     if not isinstance(s, Tangents):
         return np.zeros((s.nu, len(lane)))
     n = 1 + s.d  # directions of the start of a move come first

@@ -58,8 +58,8 @@ _KINKS = frozenset(["decision", "kink"])
 _JUMP = 1e-8
 _STEEP = 1e7
 # How often an interval is replaced by one of its quarters: the quarter in which the change of the
-# field differs most from the changes in the others. Fewer: jumps are missed behind other changes.
-# More: time.
+# field differs most from the changes in the others. Fewer: a jump is missed if the field also
+# changes a lot elsewhere in the step. More: time.
 _QUARTERS = 20
 
 Points = Float[np.ndarray, "P 1+n"]

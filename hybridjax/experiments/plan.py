@@ -70,15 +70,15 @@ _PERIODS = 8
 # Safety factor of error estimates. Smaller: experiments far from the cycle exceed their estimates.
 # Larger: `ExperimentData.error` is pessimistic.
 _CAUTION = 3.0
-# Errors of different sections partly cancel. Estimates assume that they do so by at most this
-# factor. Larger: estimates are too small if errors cancel on the cycle only. Smaller: estimates are
-# pessimistic.
+# Errors of different sections partly cancel. Estimates assume that this makes the sum smaller by at
+# most this factor. Larger: estimates are too small if errors cancel on the cycle only. Smaller:
+# estimates are pessimistic.
 _MOST_CANCELLATION = 30.0
 # Least error estimate of a step, relative to the tolerance. Smaller: weights of steps without error
 # overflow. Larger: the errors of accurate steps are overestimated.
 _LEAST_SHARE = 1e-6
 # Newton's guess of the time to the next section is used if it is wrong by less than this factor.
-# Larger: bad guesses set the length of the last step. Smaller: good ones are not used.
+# Larger: bad guesses set the length of the last step. Smaller: good guesses are not used.
 _WORST_GUESS = 3.0
 
 Accuracy = Annotated[

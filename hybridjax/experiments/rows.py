@@ -42,9 +42,9 @@ _NEAR_ZERO = 1e-7
 # factor lies between this and its inverse. Larger: bad guesses set the length of steps. Smaller:
 # good guesses are not used.
 _WORST_GUESS = 3.0
-# An event also has rows beyond a section if its distance from the section is below this part of the
-# interval. Smaller: more experiments leave the table. Larger: more rows that hardly any experiment
-# needs.
+# An event near a section may happen after it in some experiments. So it also has rows beyond the
+# section, if its distance from the section is below this part of the interval. Smaller: more
+# experiments leave the table. Larger: more rows that hardly any experiment needs.
 _NEAR_SECTION = 0.05
 
 

@@ -54,9 +54,9 @@ _SPREAD = 0.2
 # residuals, relative to that of the data, is below this. Larger: fits with errors count as perfect.
 # Smaller: perfect fits with rounding errors do not.
 _PERFECT = 1e-12
-# If they have standard deviations, no further guess is tried once the cost exceeds its mean by less
-# than this many of its standard deviations. (It has a chi-square distribution.) Larger: local
-# minima are accepted. Smaller: global minima are not, and all guesses are tried.
+# If the data have standard deviations, no further guess is tried once the cost exceeds its mean by
+# less than this many of its standard deviations. (It has a chi-square distribution.) Larger: local
+# minima are accepted. Smaller: global minima are rejected, and all guesses are tried.
 _LIKELY = 4.0
 
 # Cycles at the end of a fit are the same if their periods differ by less than this part. Larger:

@@ -36,15 +36,15 @@ from .transients import ObservedTrajectory, residuals_of, start_value, with_star
 
 
 # The iteration ends when a step changes neither the coordinates nor the residuals by more than
-# this, absolutely and relatively (both have no unit). Larger: parameters without the digits that
-# the data have. Smaller: steps that only change rounding errors.
+# this, absolutely and relatively (both have no unit). Larger: parameters are less accurate than the
+# data allow. Smaller: steps that only change rounding errors.
 _TOLERANCE = 1e-9
 # Largest number of evaluations of the model from one guess. Fewer: distant guesses do not converge.
 # More: hopeless guesses take longer.
 MAX_STEPS = 64
-# No step is taken along directions whose sensitivity is below this part of the largest one. If the
-# largest one is below this itself, no step can improve the fit. Larger: badly identified parameters
-# keep their initial values. Smaller: unidentifiable parameters drift away.
+# No step is taken along directions whose sensitivity is below this part of the largest one. If even
+# the largest sensitivity is below this number, no step can improve the fit. Larger: badly
+# identified parameters keep their initial values. Smaller: unidentifiable parameters drift away.
 _RCOND = 1e-8
 # A step is accepted if the cost falls by the part `_ACCEPTED` of the predicted reduction. If it
 # falls by the part `_GOOD`, the damping is reduced, otherwise increased. Lower: steps without gain

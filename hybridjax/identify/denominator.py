@@ -19,15 +19,15 @@ from .descent import ROUNDING, Coefficients
 
 
 # A response counts as forgotten when this part of it is left. (Scores of cycles are correlated
-# until then.) Smaller: more lags, and covariances that scatter more. Larger: covariances miss a
-# part.
+# until then.) Smaller: more lags, so that covariances scatter more. Larger: a part of each
+# covariance is missed.
 _FORGOTTEN = 0.1
 # Largest modulus of a multiplier at the start of a fit (with 0.99, a tenth is left after 230
 # cycles). Larger: simulations overflow. Smaller: slow modes start far from their minimum.
 SLOWEST = 0.99
-# A fit reduces the residuals of a block or line, which is corrected for; at least this share is
-# assumed to be left. Smaller: blocks that alone determine a coefficient dominate the covariance.
-# Larger: covariances are too small.
+# A fit reduces the residuals of a block or line, and a correction divides by the share that is
+# left. At least this share is assumed. Smaller: blocks that alone determine a coefficient dominate
+# the covariance. Larger: covariances are too small.
 _SMALLEST_REMAINDER = 0.1
 
 

@@ -47,7 +47,7 @@ _DEVIATION = 1e-3
 # the range is too small. More: time.
 _PER_STEP = 8
 # Number of periods of the design, and number of its versions with other random phases. More: time.
-# Fewer: few lines, and variances that are uncertain.
+# Fewer: H is known at few lines, and its variances are uncertain.
 _PERIODS = 16
 _REALIZATIONS = 4
 

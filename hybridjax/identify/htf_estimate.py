@@ -23,8 +23,8 @@ from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
 # Up to this number of realizations of a line, the shape of their scatter is estimated (see
-# `roundness`). Fewer: regions are too small for errors of constant modulus. With more realizations,
-# the mean is normally distributed anyway.
+# `roundness`). Smaller: if all errors have the same modulus, confidence regions are too small.
+# Larger: needless, since the mean of many realizations is normally distributed.
 _FEW_REALIZATIONS = 16
 
 
@@ -167,7 +167,7 @@ class _LineEstimates(NamedTuple):
     noise: Float[np.ndarray, "M F ny nu"] | None
     """Variance from repeated windows; None where there was one window."""
     power: Float[np.ndarray, "F nu"]
-    """Variance of white noise in the outputs, relative to the variance of the estimates."""
+    """Variance of white noise in the outputs, divided by the variance that it causes in H."""
 
 
 def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstimates:

@@ -344,10 +344,11 @@ def _solve_classes(
             noise=None,
             dof=dof,
         )
-    # The error of P changes E by its product with U, of which the references explain only a part.
-    # The other part of U adds errors of entries of P to E. For an entry at the edge of its
-    # confidence disc these errors count three times; the scatter of all other entries takes degrees
-    # of freedom.
+    # E contains the error of P times U, and `dof` accounts only for the part of U that the
+    # references explain. `left` is the other part, relative to this one: it enlarges E E*, on
+    # average by its trace times the variance. The error of the entry itself is assumed at the edge
+    # of its 95 % confidence disc, where its square is three times the variance. The scatter of all
+    # other entries reduces the degrees of freedom.
     left = spread @ block(u, u) - np.eye(len(u))
     edge = _diagonal(left @ spread) / by_input
     counted = dof + _diagonal(left).sum(axis=1)

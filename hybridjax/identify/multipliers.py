@@ -264,9 +264,8 @@ def _solve(
     )
 
 
-# Rounding errors differ from each other by at most this factor of their squares. Smaller: in exact
-# HTFs, rounding errors count as multipliers. Larger: weak multipliers of HTFs without noise are
-# missed.
+# Squares of rounding errors differ from each other by at most this factor. Smaller: in exact HTFs,
+# rounding errors count as multipliers. Larger: weak multipliers of HTFs without noise are missed.
 _ROUNDING_VARIES = 1e6
 # Probability that noise alone is taken for a multiplier; and the number of random matrices from
 # which the quantile is computed. Smaller: weak multipliers are missed. Larger: orders are too high.

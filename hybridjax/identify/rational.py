@@ -42,7 +42,7 @@ from .variable_projection import (
 _STARTS = (0, 1, 4, 29)
 # A descent ends if a step changes the residual, relative to H, by less than this. Costs that differ
 # by less are equal (a converged fit is then preferred). Smaller: descents on exact data stall in
-# rounding. Larger: coefficients are wrong by this part.
+# rounding. Larger: coefficients have relative errors of this size.
 _ACCURACY = 1e-8
 
 

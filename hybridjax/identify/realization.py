@@ -28,7 +28,7 @@ Matrices = list[Float[np.ndarray, "_ _"]]
 # Least number of sections over which a state is observed, by default. Smaller: less averaging.
 _SHORTEST_HORIZON = 8
 # A singular value must exceed the largest one of noise alone (its mean) by this factor. Larger:
-# weak states are missed. Smaller: noise makes states.
+# weak states are missed. Smaller: noise counts as states.
 _NOISE_MARGIN = 1.1
 
 

@@ -41,7 +41,8 @@ from .weights import check_values, error_weights
 # group. More: a group for each entry, which takes longer. Fewer: wrong weights.
 EQUAL_WEIGHTS = 9
 # Largest number of weighted solutions of the linearized problem; and the change of c, relative to 1
-# + |c|, that ends them. More or smaller: a closer start, which the descent does not need.
+# + |c|, that ends them. More solutions or a smaller change: the descent starts closer to the
+# minimum, which it does not need.
 _MAX_REWEIGHTINGS = 6
 _SETTLED_START = 1e-3
 

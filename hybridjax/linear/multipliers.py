@@ -19,11 +19,11 @@ Matrix = Float[np.ndarray, "_ _"]
 # Sweeps of the orthogonal iteration. Fewer: moduli that differ by a factor of ten are not told
 # apart, and the smaller one loses digits. More: time for moduli that hardly differ.
 _MOST_SWEEPS = 16
-# Part of a basis that leaves its subspace in one turn, below which it is rounding. Smaller: it
-# hides that a subspace was found. Larger: multipliers lose digits.
+# A subspace is found if the product maps a basis of it into the subspace, up to this part of the
+# basis. Smaller: rounding hides that it was found. Larger: multipliers lose digits.
 _SETTLED = 1e-14
-# Change of that part from sweep to sweep that is no progress. Smaller: sweeps in vain. Larger:
-# subspaces that are about to be found are missed.
+# If that part changes by less than this factor from one sweep to the next, there is no progress.
+# Smaller: sweeps in vain. Larger: subspaces that are about to be found are missed.
 _STALLED = 4.0
 
 

@@ -27,7 +27,9 @@ from .verdict import Visit, visits_of
 # cycle of a branch, which ends a little before, is not recognized.
 _SLOW = 0.02
 # Two events are close if their times differ by less than this part of the period; a guard is close
-# to zero if it is less than this part of its range. Larger and smaller: as for `_SLOW`.
+# to zero if it is less than this part of its range. Larger: events that are merely near each other
+# get this reason. Smaller: the last cycle of a branch, which ends a little before, is not
+# recognized.
 _CLOSE = 0.02
 
 # A cycle has shrunk to a point if its states move by less than this part of their magnitudes on the
@@ -35,8 +37,8 @@ _CLOSE = 0.02
 # contain the equilibrium ends before.
 _SMALL = 0.02
 # The cycle passes an equilibrium if there is a point with rates so small that no state would move
-# by more than this part of its magnitude in one period. Larger: slow cycles count. Smaller: a
-# branch ends before.
+# by more than this part of its magnitude in one period. Larger: slow cycles get this reason.
+# Smaller: the branch ends before its points are this slow, and gets no reason.
 _REST = 0.1
 
 # Results of a failed turn for which a cause is looked for.

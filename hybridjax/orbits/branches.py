@@ -46,7 +46,7 @@ from .verdict import verdict
 
 
 # A step is halved if the cosine of the angle between successive tangents is below this. Nearer to
-# 1: more points than a plot needs. Smaller: the branch jumps over turns.
+# 1: more points than a plot needs. Smaller: the branch jumps over sharp bends.
 _STRAIGHT = 0.97
 # At a crossing of two branches Newton's method fails. A test function is then evaluated at a point
 # nearby, at these distances (as parts of the step).

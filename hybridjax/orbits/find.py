@@ -98,7 +98,7 @@ _STRAYED = (
 # of a guess that is more than 1e18 times too large keep their errors.
 _SHRINKS = 3
 # A guess is far from the cycle if a state of the guess is this many times larger than on the cycle.
-# Larger: sizes that are too large are kept. Smaller: time, where states are at rest.
+# Larger: sizes that are too large are kept. Smaller: searches with states at rest take longer.
 _DISTANT = 1e3
 
 

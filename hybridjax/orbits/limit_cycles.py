@@ -50,8 +50,9 @@ from .rivals import coincide_on
 from .verdict import verdict
 
 
-# Number of cycles on which coinciding events are tested for whether they commute; if one of these
-# fails, all cycles are tested. More: the test takes longer. Fewer: exceptions are missed.
+# Number of cycles on which coinciding events are tested for whether they commute; if they do not
+# commute on one of these cycles, all cycles are tested. More: the test takes longer. Fewer:
+# exceptions are missed.
 _LOOKED_AT = 50
 # Number of systems from which on programs that follow itineraries are worth their compilation.
 # Fewer: a sweep waits for the compiler. More: sweeps without such programs take longer.
@@ -60,8 +61,8 @@ WORTH_COMPILING = 250
 # which the cycle begins. More: hopeless searches last longer. Fewer: cycles that begin in another
 # chart are lost.
 _TURNS = 3
-# Number of known cycles that serve as guesses for systems that follow no itinerary. More: neighbors
-# take longer to find. Fewer: guesses are worse.
+# Number of known cycles that serve as guesses for systems that follow no itinerary. More: the
+# nearest known cycle takes longer to find. Fewer: guesses are worse.
 _GUESSES = 500
 # Number of cycles that are tested for jumps and pulses of fields, and checked in full. More: sweeps
 # take longer.

@@ -49,8 +49,8 @@ from .shooting import (
 # far, and calls of a sweep run for few of their systems. Fewer: steps stay short, and most systems
 # wait.
 USUAL_STEPS = 3
-# Steps before a point of a branch, or a system of a sweep, is given up. Fewer: distant cycles are
-# lost. More: hopeless ones cost more.
+# Steps before a point of a branch, or a system of a sweep, is given up. Fewer: cycles far from the
+# guess are lost. More: searches where there is no cycle take longer.
 FEW_STEPS = 8
 # Steps before a cycle is given up. Fewer: cycles far from the guess are lost. More: hopeless
 # searches last longer.

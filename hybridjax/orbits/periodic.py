@@ -14,8 +14,8 @@ from ..systems.transition import SAME_TIME, Scheduled
 from .scale import ROUNDING
 
 
-# Functions are compared with those one period later at times this part of the period after each
-# point, where fields that jump with a clock do not jump.
+# At each point (t, q), functions are compared at the times t + `LATER` periods and one period after
+# that. (Clocks switch at simple fractions of the period; this number keeps away from them.)
 LATER = 0.0729
 # Largest allowed difference, relative to the largest value at all points. Smaller: rounding errors
 # of times are taken for another period. Larger: functions of another period pass.

@@ -55,10 +55,10 @@ _OTHER_PRODUCT = 1e-6
 # Products of multipliers are compared if they are at least this. Smaller: products that are nearly
 # zero, of which only the magnitude is known, count as faults. Larger: fewer cycles are compared.
 _LEAST_PRODUCT = 1e-6
-# A guard is below zero if its value exceeds the change that deviations of the states by this part
-# of their sizes could make. Larger: shallow excursions pass. Smaller: errors of the walk count.
+# A guard counts as negative if a change of each state by this part of its size could not make the
+# guard positive. Larger: shallow excursions pass. Smaller: errors of the walk count.
 _BEYOND = 1e-6
-# The same tolerance for the time of an event, as a part of the period. Larger: an event near its
+# An event may be this part of the period away from the zero of its guard. Larger: an event near its
 # guard passes. Smaller: rounding errors of times count as faults.
 _LATE = 1e-10
 # The shortest visit of a chart, in periods, in which guards are tested. Shorter: between events

@@ -20,7 +20,7 @@ from .scale import is_implicit
 
 
 # Error of a step, in sizes of the states, at which it is accepted. Larger: small faults of a cycle
-# pass. Smaller: steps are shortened although rounding is all that is left.
+# pass. Smaller: steps are shortened for errors that are only rounding.
 _ACCURATE = 1e-8
 # Largest error of a stretch whose end counts as known. Larger: errors of this integration count as
 # faults of the cycle. Smaller: fields with kinks cannot be checked.

@@ -1,9 +1,9 @@
 """Test whether inputs of experiments on a plant are too large or too small.
 
 `PlantCycle.run_experiments` calls `doubts_about_inputs` with the responses to an input, to half of
-it, and to none. If the response is not twice that to half of the input, the input is too large
-(curvature) or too small: simulators with fixed time steps let contacts begin at the ends of steps,
-so that the response is a *staircase* as a function of the input.
+it, and to none. The response should be twice the response to half of the input. If it is not, the
+input is too large (curvature) or too small: simulators with fixed time steps let contacts begin at
+the ends of steps, so that the response is a *staircase* as a function of the input.
 """
 
 from typing import Any
@@ -17,20 +17,21 @@ from .returns import ReturnMap
 
 
 # Difference between the response to an input and twice the response to half of it, relative to the
-# response, above which there is a finding. Larger: curvature biases weak multipliers without a
-# word. Smaller: every contact gives a finding.
+# response, above which there is a finding. Larger: curvature biases weak multipliers, and there is
+# no finding. Smaller: every contact gives a finding.
 _NONLINEAR = 1e-3
 # The response is a staircase if returns scatter by more than this part of their size when the grid
 # of time steps is shifted. Larger: stairs that bias multipliers pass. Smaller: errors of
 # integration count as stairs.
 _STAIRS = 1e-3
-# If the difference is below this part of the scatter, no contact has moved to another time step:
-# all inputs are on one stair. Larger: experiments that met a few stairs give a finding. Smaller:
-# curvature within a stair counts as another stair.
+# If the response differs from twice that to half of the input by less than this part of the scatter
+# (see `_stairs`), no contact has moved to another time step: all inputs are on one stair. Larger:
+# experiments that met a few stairs give a finding. Smaller: curvature within a stair counts as
+# another stair.
 _ON_ONE_STAIR = 0.1
-# If the difference is above this multiple of the scatter, its cause is curvature. Larger: curvature
-# passes. Smaller: stairs count as curvature; the advice is then a smaller input, which makes stairs
-# worse.
+# If this difference is above this multiple of the scatter, its cause is curvature. Larger:
+# curvature passes. Smaller: stairs count as curvature; the advice is then a smaller input, which
+# makes stairs worse.
 _MANY_STAIRS = 3.0
 
 

@@ -73,13 +73,15 @@ _GRID_ERROR = 0.03
 # small near such a jump.
 _BIAS = 1.8
 # A multiplier differs from 0, and narrow steps differ from wide steps, if the difference exceeds
-# this many standard errors. Smaller: noise is listed. Larger: multipliers hide.
+# this many standard errors. Smaller: noise is listed as a multiplier. Larger: multipliers are not
+# listed.
 _RESOLVED = 3.0
 # Relative difference of a multiplier between narrow and wide steps above which there is a finding.
 # Smaller: harmless curvature, which the errors contain, gives a finding.
 _APART = 0.1
-# Such a difference, relative to the largest multiplier, above which shorter steps are tried.
-# Smaller: twice the time for a few digits. Larger: wide regions.
+# Difference of a multiplier between narrow and wide steps, relative to the largest multiplier,
+# above which shorter steps are tried. Smaller: twice the time for a few digits. Larger: wide
+# regions.
 _CURVED = 0.01
 # Rounding error of a well-conditioned eigenvalue, in units of the norm of the Jacobian. Smaller:
 # rounding is listed as multipliers. Larger: small multipliers of smooth plants hide.

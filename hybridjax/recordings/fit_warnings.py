@@ -42,11 +42,12 @@ _SAME_OUTPUTS = 0.98
 _DAMPED = 0.9
 _DECAYED = 0.1
 # A record with fewer cycles than this is short. Larger: every result has this finding. Smaller:
-# biased multipliers have none.
+# results with biased multipliers do not have it.
 _FEW_CYCLES = 50
 # Limits of findings about phase response curves: correlation of neighboring residuals, and level of
-# the test for a flat curve. A larger correlation or a smaller level: curves that the data do not
-# support have no finding. Smaller, or larger: every curve has findings.
+# the test for a flat curve. With a larger correlation or a smaller level, curves that the data do
+# not support have no finding. With a smaller correlation or a larger level, every curve has
+# findings.
 _MEMORY = 0.2
 _LEVEL = 0.01
 # A wide band is explained by a slow input if less than this part of the input's variance lies

@@ -27,10 +27,10 @@ from .smoothing import Series
 
 
 # The edge of the band is at this many standard deviations of the push's spectrum, where 4 % are
-# left. More: wide pushes. Fewer: power beyond the band.
+# left. More: pushes are wider. Fewer: the push has power beyond the band.
 _SPECTRUM_REACH = 2.5
-# The push is cut off at this many standard deviations, where 1 % of its peak is left. More: time.
-# Fewer: the push has edges.
+# The push is cut off at this many standard deviations, where 1 % of its peak is left. More: pushes
+# take longer. Fewer: the push begins and ends with a jump.
 _PUSH_REACH = 3
 
 Responses = Float[np.ndarray, "N lags ny nu"]

@@ -44,11 +44,13 @@ from .inspection.differences import alternating_cycles
 
 # Draws of the bootstrap. More: time. Fewer: the ends of intervals scatter.
 _DRAWS = 1000
-# Number of cycles of a block, in units of the third root of the number of all cycles. More: few
-# blocks. Fewer: correlated errors of successive cycles are separated, and intervals are too narrow.
+# Number of cycles of a block, in units of the third root of the number of all cycles. More: there
+# are few blocks. Fewer: successive cycles, whose errors are correlated, fall into different blocks,
+# and intervals are too narrow.
 _BLOCK = 2.0
 # Least number of cycles of a block, and of blocks in a record; with fewer blocks, whole records are
-# drawn. More: few blocks. Fewer: correlations of disturbances are cut.
+# drawn. More: there are few blocks. Fewer: blocks are shorter than correlations of disturbances
+# last.
 _SHORTEST_BLOCK = 4
 # Three numbers are equal to this: of sections in a state, of sections between a state and its
 # instruments, and of combinations of instruments per dimension of the state. More: weak

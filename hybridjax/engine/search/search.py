@@ -7,8 +7,8 @@ recorded on a `Tape`, and `replay.py` differentiates these.
 
 Each iteration has four stages: `take_aim` chooses the length of the step, up to the next known
 time; `attempt.py` computes the step; `accept.py` accepts or rejects it; `outcome.py` makes the next
-state. A missed event has its cause in `accept.py` or `../cubic.py`, a wrong reason of a failure in
-`outcome.py`.
+state. If an event is missed, look first in `accept.py` and `../cubic.py`; if a failure has the
+wrong reason, in `outcome.py`.
 """
 
 import numpy as np
@@ -36,11 +36,11 @@ from .state import Aim, Approach, Moved, Options, Recorded, State, Stride, Task
 _AIM_WITHIN = 0.7
 # The first step, as a part of the time in which the state changes by its own magnitude, and at most
 # this part of the time allowed. (For errors of 1e-2; the default method has order 7.) Higher: first
-# steps are rejected. Lower: steps are taken until they have grown.
+# steps are rejected. Lower: many short steps at the beginning.
 _FIRST_STEP = 0.1
 # The shortest first step, as a part of the time allowed, if magnitudes of states are not known: a
 # state that begins near zero changes by its own magnitude at once. Higher: stiff systems reject the
-# step. Lower: more steps until they have grown.
+# step. Lower: more short steps at the beginning.
 _SHORTEST = 1e-6
 
 
@@ -175,8 +175,9 @@ def _known_time(state: State, task: Task) -> tuple[Times, Index, Mask]:
 def _expected_zeros(
     state: State, task: Task, step: Times, at_once: Mask
 ) -> Float[Array, "W L"]:
-    """Newton's guesses of the times to zeros of watched functions within the first `step`, for
-    lanes that know their way (see `Stride`); infinity for others."""
+    """Newton's guesses of the times to zeros of watched functions, if they lie within `step`; else
+    infinity. They are used if the caller has set `Stride.lead` (a factor that corrects the guess at
+    the start); those of guards, only in the first step after the start or after an event."""
     approach = state.approach
     xp = namespace(step)
     value, rate = state.watched

@@ -45,9 +45,9 @@ _SETTLED_GAIN = 1e-2
 # units of their variance, must be below this. Larger: multipliers miss the minimum (at 1e-3, by 3 %
 # of their standard errors).
 _SETTLED_SHIFT = 1e-3
-# If no step lowers the cost, rounding explains it if the relative gain, or the largest entry of the
-# step, is below these. (Slow states amplify rounding by up to 1e6.) Larger: stalled descents count
-# as converged. Smaller: minima of exact data do not.
+# If no step lowers the cost, the descent has converged up to rounding if the expected relative
+# gain, or the largest entry of the step, is below these numbers. (Slow states amplify rounding by
+# up to 1e6.) Larger: stalled descents count as converged. Smaller: minima of exact data do not.
 _STALLED_GAIN = 1e-10
 _STALLED_STEP = 1e-8
 

@@ -45,7 +45,7 @@ _EXCITED = 5.0
 # independent. More: few blocks.
 _BLOCK = 10
 # The instruments determine a multiplier if its squared signal-to-noise ratio exceeds this. Smaller:
-# noise makes multipliers. Larger: weak multipliers are refused.
+# noise counts as multipliers. Larger: weak multipliers are refused.
 _DETERMINED = 10.0
 
 

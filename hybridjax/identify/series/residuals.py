@@ -39,9 +39,9 @@ ANSWER = 1e-3
 # finding. Smaller: weak process noise passes, and standard errors are too small.
 _COLORED = 0.01
 # Residuals are also compared with inputs of other cycles, shifted by this many whole numbers of
-# cycles. The dependence on inputs of the same cycle must exceed this by a number of Gaussian
-# deviates. More shifts: time. More deviates: a model with too few dimensions passes. Fewer: noise
-# counts as too few dimensions.
+# cycles. The dependence on inputs of the same cycle must exceed that on the shifted ones by a
+# number of standard deviations. More shifts: time. More standard deviations: a model with too few
+# dimensions passes. Fewer: noise counts as too few dimensions.
 _SHIFTS = 8
 _ALONE = 4.0
 # Advice if inputs respond to residuals.

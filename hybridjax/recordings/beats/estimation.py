@@ -34,8 +34,8 @@ from .errors import (
 from .model import Forecast, Intervals, Table, forecast, tabulated
 
 
-# Number of half waves of a curve. More: time, for detail that the smoothness removes. Fewer: curves
-# that jump are cut off.
+# Number of half waves of a curve. More: time, for detail that the smoothness removes. Fewer: jumps
+# of curves are smoothed away.
 WAVES = 20
 # Largest number of Gauss-Newton steps; of halvings of a step; and of updates of jitter, smoothness
 # and miscounted intervals. More: time. Fewer: fits end before convergence.
@@ -46,7 +46,7 @@ _ROUNDS = 8
 _SETTLED = 1e-6
 _SAME = 0.01
 # Relative change of the cost at convergence, while jitter and smoothness still change. Larger: more
-# updates. Smaller: digits that the next update changes.
+# updates are needed. Smaller: iterations compute digits that the next update changes.
 _NEARLY_SETTLED = 1e-3
 # Standard errors are computed from this number of blocks: one for each trial if there are enough
 # trials, otherwise parts of trials with a least number of intervals. More or shorter blocks: they

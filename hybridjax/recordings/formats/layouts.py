@@ -1,8 +1,8 @@
 """Text files with or without the layouts of OpenSim, Motion Analysis and Vicon.
 
 `read.py` calls `read_text`, which returns tables of `Columns`. It recognizes a layout by its first
-lines; fields and numbers are read in `text.py`. A layout of another maker is a function here that
-returns its tables, and a line in `read_text`.
+lines; fields and numbers are read in `text.py`. To add a layout, write a function here that returns
+its tables, and call it in `read_text`.
 """
 
 from collections.abc import Iterator
@@ -110,7 +110,8 @@ def _vicon(path: Path, lines: list[str], wanted: Wanted) -> Iterator[Columns]:
 
 
 def _place(path: Path, table: Columns) -> tuple[int, Float[np.ndarray, " n"]]:
-    """Take the numbers of frames out of a table; return samples in a frame, and since the first."""
+    """Take the columns of frame numbers out of a table. Return the number of samples in a frame,
+    and for each row the number of samples since the first."""
     columns = {name.lower(): name for name in table.values}
     frame = table.values.pop(columns["frame"])
     within = np.zeros(len(frame))

@@ -29,8 +29,9 @@ _ALIKE = 1.2
 # A trial has another zero if its offset exceeds this multiple of the offsets of other trials, and a
 # part of the range. Larger: offsets pass. Smaller: scatter between trials is reported.
 _OFF = 10.0
-# Average cycles (of a number of values each) are alike if their correlation exceeds this. Larger:
-# noisy cycles differ. Smaller: other events and swapped signals pass.
+# Average cycles of two trials (tables of a number of values) are alike if their correlation exceeds
+# this. Larger: noisy cycles are reported as different. Smaller: trials with other events or swapped
+# signals pass.
 _CORRELATED = 0.8
 _PHASES = HARMONICS // 2
 # A trial has another period if the relative difference exceeds this. Larger: other speeds pass.

@@ -42,7 +42,7 @@ _MANY = 30
 # values seem skewed by chance. Smaller: bands of skewed values of few subjects are too narrow.
 _SKEWED_MEAN = 0.2
 _SKEWED_GROUPS = 0.05
-# Rotations in the test for skewed values. Fewer: its level is coarse. More: time.
+# Random rotations in the test for skewed values. Fewer: its p-values are coarse. More: time.
 _ROTATIONS = 200
 
 Maps = Inexact[np.ndarray, "n V"]
