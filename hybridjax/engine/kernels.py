@@ -145,7 +145,8 @@ def enabled(
 
 
 def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
-    """The time from t until a scheduled transition, rounding errors only, with its derivatives."""
+    """The time from t to the nearest scheduled time of a transition, with its derivatives. (Callers
+    are at such a time already, so that the value is a rounding error.)"""
     return s.kernel(_due, _expanded, g)(t, q, u)
 
 

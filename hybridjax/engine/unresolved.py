@@ -289,9 +289,10 @@ def _falls(values: np.ndarray) -> np.ndarray:
 
 
 def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Errors of a method's integrals over parts of two successive steps, as weights of the samples
-    in these steps. (Experiments and linearizations take other steps than the cycle, up to 1.5 times
-    as long.)"""
+    """Weights of the samples in two successive steps, one row for each trial step within them. A
+    row times the samples of a rate is the error of the integral over the trial step if the method
+    computes it from its stages. (Experiments and linearizations take other steps than the cycle, up
+    to 1.5 times as long.)"""
     t = np.concatenate([within, 1 + within])
     rows = []
     for begin, length in product(np.arange(5) / 4, (1.0, 1.5)):

@@ -33,8 +33,8 @@ from .rows import BEGIN, Body, Form, Rows
 
 
 # Limit of the last correction of the time of an event, in units of the period times the square root
-# of the accuracy. (After a correction, the error is about its square.) Larger: errors that are not
-# reported. Smaller: more experiments leave the table.
+# of the accuracy. (After a correction, the error is about its square.) Larger: events have errors
+# that are not reported. Smaller: more experiments leave the table.
 _LAST = 5e-3
 
 

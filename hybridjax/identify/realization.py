@@ -57,7 +57,7 @@ def realized(
     **Arguments:**
 
     - `noise`: variances of the Markov parameters. States below the noise are left out. Default:
-      those below rounding errors are.
+      only states below rounding errors are left out.
     - `dims`: dimension of the state at each section. Default: the ranks. `order`: the number of
       multipliers expected, a lower bound of dimensions.
 

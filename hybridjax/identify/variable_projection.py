@@ -63,8 +63,8 @@ class HTFGroup(NamedTuple):
     channel: Int[np.ndarray, "K 2"]
     """Output and input of the response."""
     line: Int[np.ndarray, " E"]
-    """Number of the noise from which the errors of an equation come: that of its frequency or its
-    class."""
+    """Equations with the same number have errors from the same noise: those of one frequency, or of
+    one class of frequencies."""
     period_delay: Complex[np.ndarray, " E"]
     """z^-N, the delay by one period."""
     basis: Float[np.ndarray, "2*E r"]
@@ -418,8 +418,8 @@ def equal_weights(
 ) -> list[HTFGroup]:
     """Group responses whose numerators solve the same problem, one group for each weight.
 
-    **Arguments:** `sources`: number of the noise of each frequency, see `HTFGroup.line`. `matrix`:
-    maps u real coefficients to the numerator's values.
+    **Arguments:** `sources`: for each frequency a number that says from which noise its errors
+    come, see `HTFGroup.line`. `matrix`: maps u real coefficients to the numerator's values.
     """
     harmonic, share, channel, data, weights = map(
         np.array, zip(*responses, strict=True)
@@ -462,7 +462,7 @@ def powers_basis(
     (smallest) coefficients that make each element.
     """
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
-    # (With a larger threshold, one combination less would change bounds by 0.3 %.)
+    # (The threshold is low, because leaving out one combination more would change bounds by 0.3 %.)
     kept = s > 0.1 * ROUNDING * s[0]
     columns = vh[kept].conj().T
     return u[:, kept], columns / s[kept]

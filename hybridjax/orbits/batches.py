@@ -5,7 +5,8 @@
 of its own, mostly the cycle of its nearest neighbor in the parameters. A *turn* is one application
 of the return map: the flow from the section back to it. A *tile* is a number of systems that are
 computed by one call; in it, each system is a *lane*, an entry on the last axis of every array. If a
-system fails that is found alone, look at `_step` (Newton) and `_again` (further attempts).
+system fails here whose cycle `find_limit_cycle` finds, look at `_step` (Newton) and `_again`
+(further attempts).
 """
 
 import dataclasses
@@ -68,8 +69,8 @@ def _verdict(map: ReturnMap, turn: Turn):
 
 
 def _settle(map: ReturnMap, periods: int):
-    """Simulate some periods, until the phase or the section of the guess. Returns the ends (NaN for
-    systems that do not reach it), and the expected periods."""
+    """Simulate some periods, and on to the phase of the clock or to the section at which the guess
+    begins. Returns the ends (NaN for systems that do not reach it), and the expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * periods, map.settings.scale)
     s = map.structure
     anchor = map.anchor

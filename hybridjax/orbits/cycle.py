@@ -67,9 +67,9 @@ _trajectories = Memory()
 
 # Codes of searches that end on a cycle.
 _FOUND = Result.OK, Result.SINGULAR
-# If a factor contracts its weakest direction by more than this, it is replaced by the Jacobians of
-# single steps, multiplied only as long as their product does not contract more. Larger: more cycles
-# have many factors. Smaller: small multipliers lose digits.
+# If a factor contracts its weakest direction by more than this, it is replaced by products of
+# Jacobians of single steps, each over as many steps as possible without contracting more than this.
+# Larger: more cycles have many factors. Smaller: small multipliers lose digits.
 WEAKEST = 1e-5
 # With implicit methods, multipliers below this are smaller than their errors. Smaller: errors are
 # taken for multipliers. Larger: multipliers that are accurate are given as 0.

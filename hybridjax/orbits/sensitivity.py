@@ -40,9 +40,9 @@ class Sensitivity(Showable, eqx.Module):
 
     - `parameter`: its name. `period`: derivative of the period.
     - `events`: names of the events of one period, from phase 0 on. `times` (E,): derivatives of
-        their times, which are those of the clock, or count from phase 0 if there is none.
-        `durations` (E,): derivatives of the time from each event to the next, and from the last to
-        the first.
+      their times. (Times are those of the clock, or count from phase 0 if there is no clock.)
+      `durations` (E,): derivatives of the time from each event to the next, and from the last to
+      the first.
     """
 
     parameter: str = eqx.field(static=True)

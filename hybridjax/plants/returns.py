@@ -17,7 +17,7 @@ It then calls `measured_returns`, which takes four stages:
 
 Stages 2 to 4 are repeated with the longest steps if noise may hide a multiplier, and with shorter
 steps if narrow and wide steps disagree. For a wrong multiplier, compare `ReturnMap.slopes` with a
-known Jacobian, then each stage with the one before. The constants may be changed: each says what
+known Jacobian, then each stage with the one before. The constants may be changed: comments say what
 gets worse in either direction.
 """
 

@@ -131,7 +131,8 @@ def _swapped(
 
 
 def _is_unit(ratio: float, is_output: bool) -> bool:
-    """Return whether a ratio is one of two units, up or down."""
+    """Return whether a ratio of ranges is that of two usual units (such as m and mm), in either
+    order."""
     units = [1e3, 1e6]
     if is_output:  # pushes may be chosen to be ten times as strong
         units += [10, 180 / np.pi, 1e2]

@@ -16,8 +16,9 @@ from ..recording import Recording
 from ..smoothing import RANGES, Series
 
 
-# Shortest failure of a sensor: in cycles, in samples, and (where plateaus belong to the rhythm) in
-# plateaus. Longer: failures pass. Shorter: slow phases of the motion are left out.
+# A sensor has failed if its value stays the same for longer than this: in cycles, in samples, and,
+# if plateaus belong to the rhythm, in multiples of their median length. Longer: failures pass.
+# Shorter: slow phases of the motion are left out.
 _FROZEN_CYCLES = 0.25
 _FROZEN_SAMPLES = 10
 _FROZEN_PLATEAUS = 4
@@ -26,7 +27,7 @@ _FROZEN_PLATEAUS = 4
 # reported.
 _CLIPPED = 0.005
 _MOSTLY = 5
-# A jump is an overflow if the number of levels differs from a power of two by less than this part.
+# Jumps are overflows if the number of levels differs from a power of two by less than this part.
 # Larger: impacts of a signal in integers are refused. Smaller: overflows of fast signals pass.
 _ALL_LEVELS = 0.01
 # Two signals, or two trials, are copies if more than this part of their samples is equal. Larger:
@@ -115,7 +116,8 @@ def clipped(recording: Recording, name: str) -> Iterator[Finding]:
 
 
 def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
-    """Find integers that overflow: jumps up and down by half of their levels, a power of two."""
+    """Find integers that overflow: the number of levels is a power of two, and the signal jumps up
+    and down by more than half of this number."""
     for trial, x in recording.samples(name):
         levels = np.unique(x[np.isfinite(x)])
         if len(levels) < 2:
