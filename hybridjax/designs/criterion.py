@@ -8,7 +8,7 @@ that numerators do not explain, and depends on p.
 Every criterion $\Psi$ is convex in the powers, and twice the powers give half the criterion. For
 several models, the mean of r-th powers $(\frac{1}{J} \sum_j \Psi_j^r)^{1/r}$ has both properties
 for any $r \ge 1$, so that the certificate holds. With r = 1 it is the mean. With a large r it is
-hardly less than the largest one, by a factor of $J^{-1/r}$ at most.
+nearly the largest one: it is smaller by a factor of $J^{-1/r}$ at most.
 
 The search calls `Criterion.bound(power)`, which returns a `Bound`: variances, sensitivities and the
 criterion. If the sensitivities are not the derivatives of the criterion, the search fails: test
@@ -84,7 +84,7 @@ class LinearCriterion(eqx.Module):
     wanted: Float[np.ndarray, "rows d"]
     """Derivatives of the functions by the unknowns."""
     part: Int[np.ndarray, " rows"]
-    """The quantity that a row belongs to, whose variance is the sum over its rows."""
+    """The quantity that a row belongs to. (The variance of a quantity is the sum over its rows.)"""
 
     def only(self, kept: Kept) -> "LinearCriterion":
         channels = (channel.only(kept) for channel in self.channels)

@@ -54,10 +54,10 @@ class Identifiability(Showable, eqx.Module):
     **Fields:**
 
     - `names` (p,) of the parameters. `rank`: number of identified combinations.
-    - `singular_values` (p,) of S, the largest first. Where residuals are in units of standard
-        deviations, one over a singular value is the relative standard error of its combination.
-    - `unseen` (p - rank, p): a basis of the null space with as many zeros as possible, and small
-        integers where it has such.
+    - `singular_values` (p,) of S, the largest first. If residuals are in units of standard
+      deviations, the relative standard error of a combination is one divided by its singular value.
+    - `unseen` (p - rank, p): a basis of the null space with as many zeros as possible; its rows are
+      small integers if their ratios are.
     - `sensitivity` (r, p): S.
     """
 
@@ -115,7 +115,7 @@ def _readable(basis: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
 
 
 def _rounded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
-    """Return rows scaled to small integers where they are multiples of such."""
+    """Return rows scaled so that their entries are small integers, if their ratios allow it."""
     out = []
     for row in rows:
         nearest = [Fraction(x).limit_denominator(_LARGEST_DENOMINATOR) for x in row]
@@ -190,11 +190,11 @@ class ParameterComparison(Showable, eqx.Module):
 
 
 Truth = Union[HybridSystem, LimitCycle, "ParameterFit", Mapping[str, float]]
-"""Values of parameters by name, or what has them."""
+"""Values of parameters by name, or an object that has parameters with these names."""
 
 
 class ParameterFit(WithCost, Fit):
-    """What all fits of parameters share, with their system or without.
+    """Base class of fits of parameters, those with their system and those that were saved without.
 
     **Fields:**
 

@@ -112,7 +112,7 @@ class Parameters(eqx.Module):
 
     @eqx.filter_jit
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
-        """Return coordinates of values, NaN for those outside of their bounds."""
+        """Return the coordinates of parameter values; NaN for a value outside of its bounds."""
         low, high, cases = self._bounds()
         up, down = values - low, high - values
         logarithms = [jnp.log(up / down), jnp.log(up), jnp.log(down)]

@@ -306,7 +306,7 @@ def _samples(
 def _sizes(
     name: str, std: Any, samples: Float[np.ndarray, "K ny"]
 ) -> Float[Array, " ny"]:
-    """Standard deviations of each output, or its rms.
+    """Standard deviation of each output; if none is given, its rms value.
 
     **Raises:** `DefinitionError` for another number of them, and for an output that is zero
     throughout, without one.

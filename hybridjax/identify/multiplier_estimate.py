@@ -154,9 +154,9 @@ class MultiplierFit(Fit):
     - `multipliers` (d,): by decreasing modulus, the roots of
       $p(\lambda) = \lambda^d + c_1 \lambda^{d-1} + \ldots + c_d$.
     - `coefficients` (d,): c_1 to c_d, real.
-    - `covariance` (d, d): that of the coefficients, infinite where it is unknown, estimated with
-      `covariance_dof` degrees of freedom (infinite where it is exact). All standard errors and
-      confidence regions follow from it.
+    - `covariance` (d, d): covariance of the coefficients, infinite where it is unknown. It is
+      estimated with `covariance_dof` degrees of freedom (infinite: the covariance is exact). All
+      standard errors and confidence regions follow from it.
     """
 
     multipliers: Complex[np.ndarray, " d"]

@@ -58,9 +58,9 @@ class SimultaneousEvents(NamedTuple):
     at the same time (a product of saltation matrices). It holds for neighbors of the cycle that
     reach the events in this order."""
     commute: bool
-    """Whether all orders lead through as many events to the same state, with the same derivative.
-    Orders of more than six events are not compared: `orders` then has only the order on the cycle,
-    `derivatives` is empty, and `commute` is False."""
+    """Whether all orders have the same number of events, and lead to the same state with the same
+    derivative. Orders of more than six events are not compared: `orders` then has only the order on
+    the cycle, `derivatives` is empty, and `commute` is False."""
 
 
 class _Order(NamedTuple):

@@ -1,8 +1,8 @@
 """The beginning of a search for a limit cycle: from a guess to a state on the section.
 
 `return_map_near` takes the stages in order: it checks the guess, estimates the magnitudes of the
-states, simulates for `settle`, and, if no clock drives the system, flows to the section and back to
-it (`_on_section`), which gives the period from which Newton's method starts.
+states and simulates for `settle`. If no clock drives the system, it then flows to the section and
+back to it (`_on_section`). The time between gives the first guess of the period.
 """
 
 import dataclasses

@@ -420,7 +420,7 @@ class ReturnMap(eqx.Module):
         return column + moved * self.slopes(end)[:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
-        """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
+        """The `Result` code of a state: OK if the turn is a cycle, otherwise the reason why not."""
         sizes = self.sizes
         xp = namespace(q)
         defect = self._defect(q, turn)

@@ -69,8 +69,8 @@ def _after_beginning(map: ReturnMap, events: Events, begin) -> Events:
 
 
 def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]:
-    """For each event of turns, a transition that trajectories beside the turn may meet before it,
-    or in place of it; -1 for none.
+    """For each event of turns, a transition that a trajectory near the turn may meet before this
+    event, or instead; -1 for none.
 
     The rival of an event is the event before it, if that happens at the same time; or a guard that
     is zero at the event, too (see `Tape.rival`); or a scheduled event that is due and does not

@@ -82,8 +82,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
     - `strength`: fraction of the states' variance that the instruments explain.
     - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
       `block`: cycles of a block; those of a record, where whole records are drawn.
-    - `findings`: reasons to doubt the multipliers. One of them is that one multiplier more changes
-      the largest modulus, as one for slow drift of the outputs does.
+    - `findings`: reasons to doubt the multipliers. There is one if a further multiplier, such as
+      one for slow drift of the outputs, changes the largest modulus.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -156,8 +156,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         return (low <= modulus) & (modulus <= high)
 
     def compare(self, other: Truth) -> MultiplierComparison:
-        """Pair the multipliers with true ones, or with those of another fit. There is no test: see
-        `interval`.
+        """Pair the multipliers with true multipliers, or with the multipliers of another fit. There
+        is no test: see `interval`.
 
         **Example:**
 

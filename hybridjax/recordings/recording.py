@@ -460,7 +460,8 @@ def check_events(
     at: Series,
     time: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, " k"]:
-    """Return the events within the recording, or one sample outside of it.
+    """Return the events within the recording. (One sample before its start, or after its end, is
+    allowed.)
 
     **Raises:** `DefinitionError` if all events lie outside.
     """

@@ -77,8 +77,8 @@ def place_on_host(cycle: LimitCycle, family: AbstractSections) -> PlacedSections
 
 
 def place_in_order(cycle: LimitCycle, family: AbstractSections) -> PlacedSections:
-    """The sections of a family on a cycle that is no tracer, those of a list in the order in which
-    the cycle meets them.
+    """The sections of a family on a cycle whose values are known (JAX traces none). Sections of a
+    list are in the order in which the cycle meets them.
 
     **Raises:** as `place_sections`.
     """
@@ -175,7 +175,7 @@ def _locate(
 
 
 def _all_sections(bound: BoundSections, period: Any, begins_on_section: bool) -> Target:
-    """The targets on one section after the other, until section 0 is met again."""
+    """The targets of a flow from section to section, until section 0 is met again."""
     N = len(bound.time)
     xp = namespace(bound.time)
     k = xp.arange(int(begins_on_section), N + 1)

@@ -84,8 +84,8 @@ def uneventful(state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
 def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdict:
     """Accept or reject the attempted steps, which end at t.
 
-    A step is accepted if it is accurate, every watched function is resolved over it, and none
-    crosses zero on the way before the zero on which it lands.
+    A step is accepted if it is accurate, if every watched function is resolved over it, and if no
+    watched function crosses zero before its end (or before the zero at which it ends).
     """
     approach = state.approach
     active = state.active

@@ -136,7 +136,7 @@ class Aim(NamedTuple):
     """The step that lanes attempt."""
 
     which: Index
-    """The watched function on whose zero they are to land; -1 for none."""
+    """The watched function whose zero is the end of the step; -1 for none."""
     step: Times
     """Length of the step."""
     reach: Times

@@ -232,7 +232,7 @@ def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
 def about_misfit(
     outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool, direct: bool
 ) -> list[Finding]:
-    """Return a finding if residuals depend on inputs of the period before them, or on each other.
+    """Return a finding if residuals depend on inputs of the period before, or on other residuals.
 
     Residuals that are correlated in time may seem to depend on inputs that are also correlated in
     time. They then seem to depend on inputs of other cycles as much. Therefore both dependences are

@@ -231,10 +231,10 @@ class Population(Showable):
     ) -> Any:
         """Return the mean difference a - b of two conditions or two groups, and test it.
 
-        Differences are paired in subjects that have both; subjects with one of them count, too.
-        The variances between subjects may differ in each group and condition. Covariance and
-        degrees of freedom are those of Kenward and Roger (1997). If the table also has the other
-        factor, the difference is averaged over it.
+        Differences are paired in subjects that have both; subjects that have only one of the two
+        count, too. The variances between subjects may differ in each group and condition.
+        Covariance and degrees of freedom are those of Kenward and Roger (1997). If the table also
+        has the other factor, the difference is averaged over it.
 
         **Arguments:** `covariates`: columns with common slopes. Default: none.
 
