@@ -16,13 +16,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 
 import hybridjax as hj
-from hybridjax._core.boundary import leads, words
+from hybridjax._core.boundary import leads
 from hybridjax._core.boundary.guesses.attributes import ATTRIBUTES
 from hybridjax._core.boundary.guesses.functions import CALLED, IN_NAMESPACES, NAMES
 from hybridjax._core.boundary.guesses.keywords import KEYWORDS, NEEDS
 from hybridjax._core.boundary.guesses.objects import MAKERS, OBJECTS, STEPS
 from hybridjax._core.boundary.guesses.synonyms import ALIKE, WORDS
 from hybridjax._core.showable import Showable, WithMultipliers
+from hybridjax._core.spelling import plain
 
 from .conftest import APEX, OUTPUTS
 from .test_names import all_members
@@ -429,7 +430,7 @@ def test_a_word_leads_to_one_sentence_of_an_owner(table):
         for owner in owners.split() or [""]:
             for sentence, row in owned.items():
                 for word in row.split():
-                    first = found.setdefault((owner, words._plain(word)), word)
+                    first = found.setdefault((owner, plain(word)), word)
                     assert first is word, (owner, first, word, sentence)
 
 

@@ -1,4 +1,9 @@
-"""Numbers and names, as users give them, and whether things belong together."""
+"""Numbers, indices and names as users give them, checked beyond their types; and whether two
+objects belong to the same system.
+
+Called by public functions whose arguments depend on each other (an index and a count, names and the
+system that has them).
+"""
 
 import importlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,9 @@
-"""The folder of compiled programs, which JAX's own cache keeps between processes.
+"""`enable_compilation_cache`, public in `hj.scale`: the folder in which JAX keeps compiled programs
+between processes.
 
-JAX loads machine code from there and runs it. Its cache unpickles nothing, and checks nothing, so
-the folder must be one that nobody else can fill.
+JAX loads machine code from the folder and runs it unchecked, so nobody but the user may be able to
+write there. The functions here make the folder and check its permissions. The command line and
+workers of Dask call them too.
 """
 
 import os

@@ -17,8 +17,8 @@ from .reading import is_of_package
 
 Value = TypeVar("Value")
 
-# Values that are kept in a call, some 30 for each system. Fewer: systems that take turns are looked
-# at again. More: a branch of thousands of points fills the memory.
+# Values that are kept in a call, some 30 for each system. Fewer: in calls with many systems, each
+# is looked at several times. More: a branch of thousands of points fills the memory.
 _KEPT = 1024
 
 
@@ -44,8 +44,8 @@ def _frame_of_user() -> types.FrameType | None:
 
 @contextlib.contextmanager
 def public_call() -> Iterator[bool]:
-    """A context of a call, which says whether it is a public call of its own. It is a part of the
-    one that is running if no code of the user stands between them."""
+    """A context of a call; its value says whether this is a public call of its own. If not, it is
+    part of the call that is running: no code of the user stands between the two."""
     frame = _frame_of_user()
     call = _running.get()
     if call is not None and call.frame is frame:
@@ -59,8 +59,9 @@ def public_call() -> Iterator[bool]:
 
 
 def once_in_call(key: Hashable, owner: Any, make: Callable[[], Value]) -> Value:
-    """Return what `make` returned for the same key in this public call; what it returns, outside of
-    all, or in a function of the user that a public call calls (and that may change a value).
+    """Return what `make` returned for the same key in this public call; otherwise call `make`:
+    outside of public calls, and in a user's function that a public call runs (which may change a
+    value).
 
     **Arguments:** `owner`: the object whose `id` is part of the key, which lives as long.
     """

@@ -1,4 +1,7 @@
-"""Compile functions of users and of this package: which options, and which tier.
+"""Compile functions of users and of this package, with the options that pay off for each.
+
+All rooms call it. A lane is one of many states that a program computes at once, on the last axis of
+each array; the host is this process's Python with NumPy, in place of a compiled program.
 
 - `quick_jit` compiles with few optimizations: for functions that run a few times.
 - `host_first` runs a function on the host until compiling it is worth its time.
@@ -34,7 +37,8 @@ from .progress import say_compiling
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
-# Programs of either kind that are kept. Fewer: taking turns with many systems compiles again.
+# Programs of either kind that are kept. Fewer: calls that alternate between many systems compile
+# again.
 _KEPT = 1024
 
 
@@ -135,8 +139,8 @@ def quick_jit(function: Callable) -> Callable:
 
 
 def one_program(function: Callable) -> Callable:
-    """A function that runs on the host, and where JAX traces its arguments, as one program (there,
-    single operations would be compiled one by one)."""
+    """A function that runs on the host. Where JAX traces its arguments, it is one program:
+    otherwise each operation would be compiled by itself."""
     program = quick_jit(function)
 
     @ft.wraps(function)
@@ -317,13 +321,15 @@ def _is_simple() -> bool:
 
 
 # XLA hands factorizations that are left in a program (`vector_math/rewrite.py`) to LAPACK, on the
-# threads of its pool. Two such programs in threads of their own can wait for each other for ever.
+# threads of its pool. Two programs with factorizations, run by two threads, can wait for each other
+# for ever.
 _turn = threading.Lock()
 
 
 @contextlib.contextmanager
 def in_turn(alone: bool) -> Iterator[None]:
-    """A context in which one thread is at a time, if it must be `alone`."""
+    """A context for running a program; one that must be `alone` waits until no other such program
+    runs."""
     with _turn if alone else contextlib.nullcontext():
         yield
 
@@ -338,18 +344,18 @@ def kernel(
     """`function(*static, *trees, *point)` of single points, brought to lanes by a `form` and
     compiled, as a function of NumPy's arrays.
 
-    `form(function, *trees)` is a function of arrays with lanes on their last axis, as its result
-    is (see `engine/kernels.py`). An argument may have one lane where others have more. Where only
-    `some` lanes are needed (a mask), the other lanes get the results of one of these. `function`
-    and `form` belong to modules, so that they are the same objects in each call.
+    `form(function, *trees)` is a function of arrays with lanes on their last axis, as its result is
+    (see `engine/kernels.py`). An argument may have one lane where others have more. `some` is a
+    mask of the lanes that are needed; all others get the results of one needed lane. `function` and
+    `form` have to be the same objects in each call, so they are defined at the top of modules.
 
     One program serves everything of the same structure: the same classes, static fields, functions,
-    and shapes and types of arrays. The arrays themselves are arguments. It also serves systems of
-    other classes that compute the same (a class whose cell in a notebook has run again).
+    and shapes and types of arrays. The arrays themselves are arguments. Two classes that compute
+    the same share it, such as a class whose notebook cell has run again.
 
-    The program is for this number of `lanes`: more are done in several calls, fewer are filled up.
-    (XLA runs the smallest programs, of a thousand operations, in the thread that calls them, and
-    hands larger ones to another thread, which takes longer than they do.)
+    The program is for this number of `lanes`: more lanes are done in several calls, fewer are
+    filled up with copies. (XLA runs the smallest programs, of a thousand operations, in the thread
+    that calls them, and hands larger ones to another thread, which takes longer than they do.)
     """
     program, arrays = _bound(function, form, static, trees, lanes)
     return ft.partial(_run_lanes, program, [_of_jax(x) for x in arrays], lanes)
@@ -437,8 +443,8 @@ def _bound(
 
 
 def _nearby(x: Any) -> Any:
-    """An array on the CPU. (One of an accelerator is copied once, by way of NumPy, and not in each
-    call. One of NumPy is kept: to make it one of JAX takes 20 times as long as to call with it.)"""
+    """An array on the CPU. (An accelerator's array is copied once, by way of NumPy, and not in each
+    call. A NumPy array stays: converting it to JAX takes 20 times as long as calling with it.)"""
     device = getattr(x, "device", None)
     is_there = getattr(device, "platform", "") == "cpu"
     return x if is_there else np.asarray(x)
@@ -472,7 +478,8 @@ def _kernel_program(function, form, static, structure, leaves, options) -> Calla
 
 
 def identity(trees: Any) -> tuple:
-    """All of trees but the values of arrays; of a system what it computes, not how it is done."""
+    """All of trees but the values of arrays. Of a system: the digest of what it computes, whatever
+    its code looks like."""
     parts, structure = jax.tree_util.tree_flatten(
         trees, is_leaf=lambda x: bool(program_digest(x))
     )
@@ -489,7 +496,7 @@ def _identity_of_part(x: Any) -> Hashable:
 
 
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
-    """x with so many lanes, those beyond L copies of its first."""
+    """x with `filled` lanes: its L lanes, then copies of the first."""
     if x.shape[-1] == 1:
         return x.repeat(filled, axis=-1)
     if filled == L:

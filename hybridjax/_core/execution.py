@@ -93,9 +93,9 @@ def core_count() -> int:
 
 
 # OpenBLAS divides matrices of a hundred columns among threads that wait for each other longer than
-# they compute. Only the libraries in the wheels of NumPy and SciPy are known; others (Accelerate,
-# MKL, those of distributions) are left alone. Their functions have 64-bit or 32-bit integers, and a
-# prefix or none.
+# they compute. Only the libraries in the wheels of NumPy and SciPy are known; other libraries
+# (Accelerate, MKL, those of Linux distributions) are left as they are. Their functions have 64-bit
+# or 32-bit integers, and a prefix or none.
 _NAMES = (
     "scipy_openblas_{}_num_threads64_",
     "scipy_openblas_{}_num_threads",

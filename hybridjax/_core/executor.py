@@ -1,10 +1,14 @@
-"""One source, two executors: programs of XLA, and the host.
+"""One source for two executors: compiled programs of JAX, and the host (Python with NumPy).
 
-Code that decides (step sizes, events, Newton's method) is written once, on arrays. Given JAX's, it
-is traced and compiled, which pays for many lanes and below `jit`, `vmap` and `grad`. Given NumPy's,
-it runs at once, and only what users wrote is compiled, in small programs (`compilation.kernel`):
-for a few lanes that is the quicker way to a first answer. Nothing switches between the two but the
-arrays themselves: functions come from their `namespace`, and those below do for both what differs.
+Code that decides (step sizes, events, Newton's method) is written once, on arrays. If the arrays
+are JAX's, the code is traced and compiled. That pays for many lanes (states computed at once), and
+below `jit`, `vmap` and `grad`. If they are NumPy's, the code runs at once, and only users'
+functions are compiled, in small programs (`compilation.kernel`). That gives a first answer sooner
+for a few lanes.
+
+There is no other switch between the two than the type of the arrays. `namespace` returns the
+library that belongs to an array, and the functions here do whatever NumPy and JAX write
+differently.
 """
 
 import contextlib
@@ -30,7 +34,7 @@ else:
 
 class Definition(eqx.Module):
     """What users write: functions, and numbers that they compute with. Its arrays are always JAX's,
-    whoever runs the code around it.
+    also where the code around it runs on the host.
 
     `code_digest` is set where a public function takes the object (`meaning.current`), so that
     compiled programs belong to the code as it was then.
@@ -70,8 +74,8 @@ def namespace(x: Array) -> Any:
 
 
 def to_host(tree: Any) -> Any:
-    """`tree` with its arrays on the host, but for those of a `Definition`. Where JAX traces some of
-    them, all remain what they are."""
+    """`tree` with its arrays on the host, except those in a `Definition`. If JAX traces any array
+    of the tree, it is returned unchanged."""
     traced = is_traced(tree)
     return jax.tree_util.tree_map(
         lambda x: np.asarray(x) if isinstance(x, jax.Array) and not traced else x,
@@ -156,8 +160,9 @@ def lane(x: Array, i: Array) -> Array:
 def solve(matrices: Array, right: Array) -> Array:
     """`linalg.solve` of a stack of matrices, with one right side for each or for all.
 
-    A program solves one after the other. XLA would divide a stack among its threads and wait for
-    them in one of these: two stacks at once wait for ever on two cores (JAX 0.10).
+    A program solves one matrix after the other. Otherwise XLA divides the stack among its threads,
+    and one of these threads waits for the rest: on two cores, two stacks at once wait for ever (JAX
+    0.10).
     """
     if on_host(matrices):
         return np.linalg.solve(matrices, right)
@@ -234,8 +239,8 @@ def as_numpy() -> contextlib.AbstractContextManager:
 
 
 def on_the_cpu() -> contextlib.AbstractContextManager:
-    """A context in which JAX computes on the CPU. (A few lanes take longer on an accelerator, whose
-    programs call hundreds of small kernels one after the other.)"""
+    """A context in which JAX computes on the CPU. (On an accelerator a few lanes take longer: a
+    program there starts hundreds of small kernels, one by one.)"""
     if on_cpu():
         return contextlib.nullcontext()
     return jax.default_device(jax.local_devices(backend="cpu")[0])

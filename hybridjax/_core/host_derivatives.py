@@ -56,11 +56,11 @@ def by_columns(
 
     `along(arguments, directions)` returns the result and its derivatives in P directions. A
     direction moves a single number of the arguments: `directions` is a tree of their form with
-    arrays (P, ...), and `None` for what does not move; so is the second result. Values are
-    concrete there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along`
-    raises `NotOnHostError`, or more than `most` numbers move, derivatives are compiled, as inside
-    of programs. `relevant` replaces those tangents of the first argument by `None` that make no
-    difference.
+    arrays (P, ...), and `None` for what does not move; so is the second result. Values are concrete
+    there, also where JAX hides tangents: in reverse mode, and below `vmap`. Where `along` raises
+    `NotOnHostError`, or more than `most` numbers move, derivatives are compiled, as inside of
+    programs. `relevant` replaces tangents of the first argument by `None` if the result does not
+    depend on them.
     """
     derived = eqx.filter_custom_jvp(lambda *arguments: compiled(*arguments))
 

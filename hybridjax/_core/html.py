@@ -91,9 +91,7 @@ def multiplier_table(
     else:
         columns = {
             "multiplier": [*map(rounded, values, errors)],
-            "± standard error": [
-                standard_error(x) if np.isfinite(x) else "unknown" for x in errors
-            ],
+            "± standard error": [standard_error(x) for x in errors],
         }
     columns["modulus"] = [f"{abs(z):.6g}" for z in values]
     return table(tuple(columns), zip(*columns.values(), strict=True))

@@ -58,7 +58,7 @@ def is_program(x: Any) -> bool:
 
 
 def closed(x: Program | ClosedProgram) -> ClosedProgram:
-    """A program with its constants, of which one without has none."""
+    """A program with its constants (an empty list if it has none)."""
     return x if isinstance(x, jex.ClosedJaxpr) else jex.ClosedJaxpr(x, [])
 
 
@@ -226,8 +226,8 @@ def solved_by(equation: Equation) -> tuple[Any, Any, list, Equation] | None:
 
 
 def is_outer(equation: Equation) -> bool:
-    """Return whether functions in the inner programs of an equation may be replaced. (Those with
-    derivative rules of their own are left alone.)"""
+    """Return whether functions in the inner programs of an equation may be replaced. (Equations
+    with derivative rules of their own are left as they are.)"""
     return equation.primitive.name in _OUTER
 
 
@@ -253,9 +253,9 @@ def is_hosted(equation: Equation) -> bool:
 def calls_lapack(program: Program) -> bool:
     """Return whether a program may call LAPACK, also in its inner programs.
 
-    Two such programs at once can wait for each other for ever. Therefore the answer follows from
-    the primitives that were traced, and not from the text that XLA makes of them. If JAX adds a
-    primitive for LAPACK under a new name, the test of this function fails.
+    Two programs with such calls, run at once, can wait for each other for ever. Therefore the
+    answer follows from the primitives that were traced, and not from the text that XLA makes of
+    them. If JAX adds a primitive for LAPACK under a new name, the test of this function fails.
     """
     return not _LAPACK.isdisjoint(primitives_of(program))
 
@@ -411,7 +411,7 @@ def keep_programs_in(folder: pathlib.Path) -> None:
 
 def kept_programs(folder: pathlib.Path) -> Iterator[pathlib.Path]:
     """The files of a folder of programs that JAX reads or writes (`...-cache`, `...-atime`). If JAX
-    names them otherwise, files of other users among them are not refused."""
+    names its files differently, files of other users in the folder are not refused."""
     yield from folder.glob("*-[ac]*e")
 
 

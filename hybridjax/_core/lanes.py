@@ -1,7 +1,9 @@
-"""Many lanes: functions of single states brought to them, `vmap` as more lanes, derivatives.
+"""Functions of single states brought to many lanes; `jax.vmap` as more lanes; derivatives by lane.
 
-Lanes stand on the last axis of an array. What all lanes share (a system's parameters, say) is
-passed as it is; where each lane has its own, it is marked by `PerLane`.
+A lane is one of many states that a program computes at once; lanes stand on the last axis of an
+array. An argument that all lanes share (a system's parameters, say) is passed as it is. One that
+differs from lane to lane is marked by `PerLane`. Called by the engine, systems, sections and
+orbits.
 """
 
 import functools as ft
@@ -57,7 +59,7 @@ def one_lane(tree: Any) -> Any:
 
 
 def _split_of(tree: Any, count: int) -> tuple[bool, ...]:
-    """Which of a tree's arrays, of which there are so many, have one entry for each lane."""
+    """Which of a tree's `count` arrays have one entry for each lane."""
     return tree.split if isinstance(tree, PerLane) else (False,) * count
 
 
@@ -69,9 +71,9 @@ def by_lane(
 ) -> Callable:
     """Vectorize `function(*trees, *arguments)` over the lanes on the last axis of `arguments`.
 
-    Of a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane where
-    others have more is the same for all of them, and what depends on nothing else is computed once.
-    `quick`: to compile, instead of to run: without trigonometric functions of many lanes.
+    From a tree that is a `PerLane`, each lane gets its own part. An argument with a single lane is
+    shared by all lanes of the other arguments; what depends on shared arguments alone is computed
+    once. `quick`: to compile, instead of to run: without trigonometric functions of many lanes.
     `by_row`: as in `vectorized`.
     """
     arrays, static = eqx.partition([shared(x) for x in trees], eqx.is_array)
@@ -210,7 +212,8 @@ def lane_jvp(
 
     end, columns = jax.vmap(push, out_axes=(None, 0))(jnp.eye(total))
 
-    # One row for each direction: (total, L) for what lanes have of their own, (total, 1) else.
+    # One row for each direction: Shape (total, L) if lanes have different values, otherwise (total,
+    # 1).
     rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]
     for leaf in leaves(t_common):
         rows.append(jnp.broadcast_to(leaf.reshape(-1, 1), (leaf.size, 1)))
@@ -323,8 +326,8 @@ def put_rows(
 
 
 def pick(x: Array, rows: Sequence[int], which: Int[Array, " L"]) -> Array:
-    """Each lane's entry in the row of its function `which` of x, whose rows are those of the
-    functions `rows`; 0 where it is not among them."""
+    """For each lane, its entry in one row of x. The rows of x belong to the functions `rows`, and
+    the lane's row is that of its function `which`; 0 if `rows` does not have it."""
     xp = namespace(x)
     if on_host(x) or len(rows) > _FEW:
         place = np.full(max(rows, default=0) + 2, -1)  # the last for -1

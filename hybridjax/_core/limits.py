@@ -1,6 +1,9 @@
-"""How much one call may ask for, and how much a file may declare: more is a slip of the hand, or
-damage, or malice, and ends in a sentence before memory is taken. Less would refuse what a large
-computer can do."""
+"""How much one call may ask for, and how much a file may declare.
+
+More is a typing error, a damaged file or an attack, and is refused in a sentence before memory is
+taken. Smaller limits would refuse what a large computer can do. Read by the functions that take
+counts, and by readers of files.
+"""
 
 COUNT = 10**9
 """Steps, and whatever has no limit below."""

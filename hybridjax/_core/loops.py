@@ -1,4 +1,4 @@
-"""A loop whose derivatives in forward mode run along with it."""
+"""A loop that carries its forward-mode derivatives along in the same iterations."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,9 +28,9 @@ def loop(
 ) -> tuple[Any, Any]:
     """`carry, notes = step(constants, k, carry, notes)` for k = 0, ..., count - 1.
 
-    JAX differentiates a loop after passes over its body, several at each level of nesting, that
-    find out what depends on what. Here all of the carry does, and the body says how; notes have no
-    derivatives. Reverse mode cannot differentiate this loop.
+    To differentiate a loop, JAX first goes through its body several times, at each level of
+    nesting, to find out what depends on what. Here all of the carry does, and the body says how;
+    notes have no derivatives. Reverse mode cannot differentiate this loop.
 
     **Arguments:** both steps hold no numbers with derivatives of their own.
     """

@@ -1,9 +1,11 @@
-"""Digests of what definitions compute: of systems by their programs, of others by their code.
+"""Digests of what users' definitions compute, to notice that a function has changed.
 
-A user's function reads constants of a notebook, calls helpers and methods, and holds arrays. JAX
-traces it once, and does not notice that one of these has changed. Here a system's functions are
-traced again, and the programs are compared. This is left out if a reading of the code
-(`reading.py`) proves that nothing has changed.
+A digest is a short text that is equal for equal content. A user's function reads constants of a
+notebook, calls helpers and methods, and holds arrays. JAX traces the function once, and does not
+notice later that one of these has changed. So in each public call, `current` traces a system's
+functions again and compares the programs (`programs.py`). It skips this if a reading of the code
+(`reading.py`) proves that nothing has changed. Definitions that are no systems are known by their
+code alone.
 """
 
 import collections
@@ -30,10 +32,11 @@ from .reading import Reading
 
 Thing = TypeVar("Thing")
 
-# Definitions whose digests are kept. Fewer: taking turns with many systems traces them again.
+# Definitions whose digests are kept. Fewer: calls that alternate between many systems trace them
+# again.
 _KEPT = 1024
-# Further traces of a function that may draw random numbers, all of which must be the same. Fewer:
-# one that draws one of two numbers passes more often. More: time.
+# Further traces of a function that may draw random numbers; the function is refused unless all are
+# the same. Fewer: a function that draws one of two numbers is missed more often. More: time.
 _DRAWS = 3
 
 
@@ -96,7 +99,8 @@ def _mark(x: Any, digest: str) -> Any:
     return marked
 
 
-# An object that is given again has the same copy, which others may remember.
+# The marked copy of each object, so that the same object always has the same copy: values are
+# remembered by the copy.
 _marked = Memory()
 
 
@@ -148,7 +152,7 @@ def _digest_of(x: Definition) -> str:
         return reading.digest
     reading = Reading(_with_forms(x), marks=True)
     _require_values(reading)
-    # (A class that has not been seen is traced, however much it is like another one.)
+    # (A new class is always traced, even if its code is equal to that of another one.)
     read: collections.OrderedDict[str, None]
     read = _read.recall(type(x), None, collections.OrderedDict)
     known = _digests.get(reading.digest) if reading.digest in read else None
@@ -172,8 +176,8 @@ def _digest_of(x: Definition) -> str:
     return digest
 
 
-# Digests of definitions by those of their readings, and digests of their parts by name. (They hold
-# no object of a user.)
+# From the digest of a definition's reading to the digest of the definition, and from names of its
+# parts to their digests. (They hold no object of a user.)
 _digests: collections.OrderedDict[str, str] = collections.OrderedDict()
 _programs: collections.OrderedDict[str, dict[str, str]] = collections.OrderedDict()
 # By class, digests of readings of its objects.
@@ -350,7 +354,7 @@ def program_digest(x: Any) -> str:
 
 def code_of(x: Definition) -> str:
     """Return a digest of all code of a definition, for functions that are no part of it (pictures).
-    It may change where they do not."""
+    (This digest may change although the programs have not changed.)"""
     return Reading(_without_arrays(x)).digest
 
 

@@ -1,8 +1,9 @@
-"""Digests of programs: of what JAX traces of functions, in a form that does not depend on names.
+"""Digests of programs: short texts that are equal if two programs compute the same.
 
-Each result of a program has a digest of its own: of the operations by which it is computed from
-the arguments and from constants. Operations whose results are not used do not count, nor how a
-program is divided into functions of `jax.jit`.
+A program is what JAX traces of a function. Each of its results has its own digest, made from the
+operations that lead to the result from the arguments and constants. Names do not enter, nor
+operations whose results are not used, nor how the program is divided into functions of `jax.jit`.
+Called by `meaning.py`.
 """
 
 import hashlib

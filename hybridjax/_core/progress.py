@@ -1,8 +1,7 @@
-"""What long calls say of themselves while they run: one line, which appears after a second and
-vanishes at the end.
+"""The progress line of long calls: it appears after a second and vanishes at the end.
 
-It is shown in terminals and in Jupyter. Where nobody watches (logs, pipes, tests) there is none,
-and to say something costs next to nothing.
+The line is shown in terminals and in Jupyter, not in logs, pipes and tests. There a report of
+progress costs next to nothing.
 """
 
 import contextlib
@@ -21,8 +20,8 @@ from .boundary.checked import checked
 
 Item = TypeVar("Item")
 
-# Seconds until the line appears, and between updates. Less: it flickers in short calls. More:
-# nothing is shown for long.
+# Seconds until the line appears, and between updates. Less: the line flickers in short calls. More:
+# long waits without a line.
 _DELAY = 1.0
 _LINE = "{desc}, {elapsed}"
 _COUNTED = "{desc} {bar:20} {elapsed}, {remaining} left"

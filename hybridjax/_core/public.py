@@ -1,7 +1,8 @@
-"""Public names: where they are, and what became of earlier ones.
+"""Public names: the module that each one is in, and the new names of those that were renamed.
 
-The `__init__.pyi` of a namespace lists its public names. Each is imported when it is first used
-(PEP 562), and type checkers read the same list.
+The `__init__.pyi` of a namespace lists its public names. Each name is imported when it is first
+used (PEP 562), and type checkers read the same list. The `__init__.py` of each namespace calls
+`attach`.
 """
 
 import ast
@@ -18,8 +19,8 @@ from .exceptions import UnknownAttribute
 
 _ROOT = pathlib.Path(__file__).parents[1]
 
-# Names that became others before version 0.2, and those now. (A namespace stands before names
-# that are others elsewhere.)
+# From names that were changed before version 0.2 to their present ones. (A namespace stands before
+# names that are others elsewhere.)
 _NAMES = {
     "Advice": "hj.recordings.Diagnosis",
     "FrequencyResponse": "hj.designs.ResponseGoal",
@@ -66,7 +67,7 @@ _NAMES = {
     "write_design": "design.write(path)",
     "write_report": "result.write_report(folder)",
 }
-# Arguments of functions and attributes of classes that became others, and those now.
+# From former names of arguments and attributes to the present ones.
 _WORDS = {
     "Crossing.function": "signal",
     "Design.f": "frequency",

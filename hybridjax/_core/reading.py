@@ -1,8 +1,8 @@
-"""What functions and objects read: their code, and the values that this code can reach.
+"""A reading: a list of all code and values that a function or an object can reach, with one digest.
 
-A reading has a digest, which says what was read, and lists what it could not read. It is a mark:
-if nothing was left unread and the digest is the same as before, then nothing has changed. If the
-digest differs, what is computed may still be the same (see `meaning.py`, which compares that).
+A digest is a short text that is equal for equal content. If the digest is the same as before, and
+nothing was left unread, then nothing has changed. If it differs, the function may still compute the
+same: `meaning.py`, which calls this module, then compares traces.
 """
 
 import builtins

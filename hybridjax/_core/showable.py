@@ -1,5 +1,6 @@
-"""What every result of a public function can do besides its own (`Showable`), and those with
-multipliers."""
+"""Base classes of results: `Showable`, with what each result can do in a notebook and in print; and
+the one for results that have multipliers.
+"""
 
 import importlib
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,6 @@
-"""Names of signals that know their units, from where these are declared to the axes of figures."""
+"""Names of signals with their units: strings that know their unit, from the declaration in a system
+to the axes of figures.
+"""
 
 from collections.abc import Iterable
 from typing import Any

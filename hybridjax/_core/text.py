@@ -16,8 +16,8 @@ from .signal import unit_of, with_unit
 
 # Characters of a line. More: lines wrap in a notebook. Fewer: short modules take a screen.
 _WIDTH = 100
-# Numbers of an array up to which they are printed; of more, only shape and range. More: fields of a
-# module no longer stand on one line.
+# Arrays with up to this many numbers are printed in full; of larger ones, only shape and range.
+# More: fields of a module no longer stand on one line.
 _FEW = 4
 # Decimals up to which a standard error has no power of ten. More: zeros to count. Fewer: errors of
 # usual fits look unlike their values.
@@ -115,9 +115,11 @@ def rounded(x: Any, error: Any) -> str:
 
 
 def standard_error(error: Any) -> str:
-    """A standard error with two digits."""
-    if error == 0 or not np.isfinite(error):
-        return f"{error:g}"
+    """A standard error with two digits; `unknown` if the data do not determine the estimate."""
+    if not np.isfinite(error):
+        return "unknown"
+    if error == 0:
+        return "0"
     return _to_places(float(error), 1 - _exponent(error), most=_PLAIN_DECIMALS)
 
 

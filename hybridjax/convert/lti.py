@@ -272,8 +272,8 @@ def _toeplitz(
     """The matrix with the Fourier coefficient m - n of x (p, k, i, j) in block (m, n), by a
     quadrature with these angles and weights (p, k)."""
     k = np.arange(-2 * order, 2 * order + 1)
-    turns = np.exp(-1j * k[:, None, None] * angles)
-    waves = weights * turns
+    phasors = np.exp(-1j * k[:, None, None] * angles)
+    waves = weights * phasors
     coefficients = np.einsum("mpk,pkij->mij", waves, x)
     m = np.arange(-order, order + 1)
     blocks = coefficients[m[:, None] - m + 2 * order]

@@ -1,16 +1,20 @@
 r"""The powers that give the smallest variance within limits, and their division into experiments.
 
-For a given estimator the variance of a goal is $\sum_k a_k^2 / p_k$, with $a_k^2 = p_k^2 s_k$ at
-the powers for which it is the best one, and sensitivities $s_k = -\partial \Psi / \partial p_k$.
-For other powers the best estimator is better still, so that powers that make this sum small make
-the variance $\Psi$ smaller (a majorization; with one limit it is the multiplicative algorithm of
-Silvey, Titterington and Torsney 1978 with the square root, which Yu, Ann. Statist. 38, 2010, proved
-to be monotone).
+For a fixed estimator the variance of a goal is $\sum_k a_k^2 / p_k$. If the estimator is the best
+one for some powers p, then $a_k^2 = p_k^2 s_k$ with the sensitivities $s_k = -\partial \Psi /
+\partial p_k$. For other powers another estimator is even better. So powers that reduce this sum
+also reduce the variance $\Psi$ (a majorization; with one limit it is the multiplicative algorithm
+of Silvey, Titterington and Torsney 1978 with the square root, which Yu, Ann. Statist. 38, 2010,
+proved to be monotone).
 
 *Proof of optimality.* $\Psi$ is convex and $\Psi(tp) = \Psi(p)/t$, so that for every q within the
 limits $\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_k$, a linear program
 (the general equivalence theorem; Pronzato and Pazman, *Design of Experiments in Nonlinear Models*,
 2013). With one limit e is the largest sensitivity per unit of the limit, 1 at the optimum.
+
+`optimize.py` calls `allocate` (the iteration over powers), `certify` (e), `worthwhile` (which
+cosines matter) and `to_design` (their division into experiments). If designs are poor, look first
+at the certificate: it is near 1 if `allocate` is right.
 """
 
 from typing import NamedTuple
@@ -26,28 +30,30 @@ from .criterion import Bound, Criterion
 from .limits import PowerLimits
 
 
-# Powers never fall below this part of the largest one during the search, so that numerators stay
+# During the search, powers are at least this part of the largest one, so that numerators are
 # determined at all lines. Larger: variances are larger by as little. Smaller: rounding errors.
 _FLOOR = 1e-9
-# Excess of the certificate at which powers are accepted. Larger: more cycles than necessary (by a
-# tenth of it, typically). Smaller: many more steps for a gain that no experiment shows.
+# Powers are accepted if the excess of the certificate is below this. Larger: more cycles than
+# necessary (typically by a tenth of this). Smaller: many more steps for a gain that no experiment
+# shows.
 ENOUGH = 0.02
 # Largest number of steps. Fewer: several limits end with a certificate above 1.02.
 _MAX_STEPS = 300
-# Steps between two certificates, and of the iteration for the prices of several limits. Fewer of
-# the latter: the limits are not met, and the criterion may rise.
+# Number of steps between two certificates; and number of steps of the iteration for the prices of
+# several limits. Fewer of the latter: the limits are not met, and the criterion may rise.
 _CHECK = 5
 _PRICES = 8
-# Factor by which the length of steps (the multiple of their logarithm) grows; it is halved where a
-# step raises the criterion. Larger: more steps in vain. Smaller: more steps.
+# Factor by which steps of log p grow. (A step that raises the criterion is halved.) Larger: more
+# steps in vain. Smaller: more steps.
 _LONGER = 1.15
 # Sweeps by which experiments are brought to the same power. Fewer: they differ by more than 1e-6.
 _SWEEPS = 100
-# Part of the total gain that is left out with weak cosines. Larger: lines are lost whose absence
-# distortion of strong ones reveals. Smaller: lines without effect occupy experiments.
+# Weak cosines are left out as long as their part of the total gain is below this. Larger: lines are
+# lost whose absence distortion of strong ones reveals. Smaller: lines without effect occupy
+# experiments.
 _NEGLIGIBLE = 1e-4
-# Remaining share of a cosine in an experiment, relative to its largest share, that is dropped.
-# Larger: experiments differ in power. Smaller: cosines without effect occupy experiments.
+# The share of a cosine in an experiment is dropped if it is below this part of the cosine's largest
+# share. Larger: experiments differ in power. Smaller: cosines without effect occupy experiments.
 _WEAK = 1e-4
 
 
@@ -55,7 +61,7 @@ class Certificate(NamedTuple):
     """A bound of the improvement by other powers within the limits."""
 
     excess: float
-    """e: no other powers can make the criterion smaller than a part 1/e of its value."""
+    """e: no other powers can reduce the criterion by more than the factor 1/e."""
     relative: Powers
     """Sensitivities, relative to the price of a cosine's power: 1 on the average over the power,
     and e at most. NaN where no active limit applies to a cosine."""
@@ -71,8 +77,8 @@ def certify(
 
     **Arguments:** `level`: as in `PowerLimits.tangent`.
     """
-    # In units of the power that each cosine may have alone, since the solver's tolerances are
-    # absolute.
+    # (In units of the power that each cosine may have alone, since tolerances of the solver are
+    # absolute.)
     limits = limits.tangent(power, level)
     alone = 1 / np.abs(limits.cost).max(axis=0)
     gain = alone * bound.sensitivity / (power @ bound.sensitivity)
@@ -141,8 +147,8 @@ def _cheapest(
 
 
 def worthwhile(cosines: Candidates, gain: Powers, experiments: int) -> Kept:
-    """Return the cosines that matter, and that so many experiments can hold: of each class of lines
-    that interfere with each other the best ones.
+    """Return the cosines that matter and fit into `experiments` experiments. (An experiment can
+    have one line of each class, so that the best lines of each class are kept.)
 
     **Arguments:** `gain` of each.
     """
@@ -166,8 +172,8 @@ def to_design(
     usual: Design,
     seed: int,
 ) -> Design:
-    """Return experiments in which each cosine has this power on the average, and which all take the
-    same share of the limits. Strong cosines occur in several experiments, weak ones in one.
+    """Return experiments in which the cosines have these powers on average. All experiments use the
+    same share of the limits. Strong cosines occur in several experiments, weak cosines in one.
 
     **Arguments:** `use`: the share of the limits that each cosine takes.
     """
@@ -194,8 +200,8 @@ def to_design(
 def _dealt(
     cosines: Candidates, use: Powers, experiments: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "K E"]:
-    """Return the share of the limits that each cosine takes in each experiment: of each class of
-    lines, of which an experiment holds one, strong cosines get several experiments."""
+    """Return the share of the limits that each cosine takes in each experiment. An experiment has
+    at most one line of each class. Strong cosines get several experiments."""
     share = np.zeros((len(use), experiments))
     classes = line_class(cosines.line, cosines.periods)
     for number in np.unique(classes):
@@ -210,8 +216,8 @@ def _dealt(
 
 
 def _balanced(share: Float[np.ndarray, "K E"], use: Powers) -> Float[np.ndarray, "K E"]:
-    """Return shares of which each experiment has the same sum, and each cosine its own, without
-    those that are negligible."""
+    """Return shares with the same sum for each experiment, and the given sum for each cosine,
+    without negligible shares."""
     experiments = share.shape[1]
     for _ in range(_SWEEPS):
         of_experiment = use.sum() / experiments

@@ -1,4 +1,10 @@
-"""The cosines among which power is divided: the signals that they cause, and their measurement."""
+"""The cosines among which a design divides power (`Candidates`), the signals that they cause, and
+their measurement (`Noise`, `Measured`).
+
+All other files of `designs` use `Candidates`. `mean_squares` gives the power of each signal per
+unit of power of each cosine, for limits; `measured_htfs` gives the HTFs with their variances, for
+criteria. `draw_models` is public: models from the confidence region of an estimate.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
@@ -31,8 +37,9 @@ NoiseLike = Mapping[str, Positive | Callable[[np.ndarray], np.ndarray]] | Positi
 # Default noise, relative to the rms of the output in the usual design: 20 dB. It scales all
 # standard errors; the optimal powers depend only on the ratios of the outputs.
 _NOISE = 0.1
-# Draws for each model that is wanted. More: estimates that are nearly unstable are accepted, whose
-# stable draws represent the confidence region poorly. Less: estimates with slow modes are rejected.
+# Largest number of draws for each model. More: estimates that are nearly unstable are accepted,
+# although their stable draws represent the confidence region poorly. Fewer: estimates with slow
+# modes are rejected.
 _TRIES = 20
 
 
@@ -87,7 +94,7 @@ class Candidates(NamedTuple):
         return H[:, place, :, self.channel]
 
     def places(self, design: Design) -> Int[np.ndarray, " L"]:
-        """Return the index of the cosine that each line of a design is."""
+        """Return the index of the cosine of each line of a design."""
         inputs = self.channel.max() + 1
         key = self.line * inputs + self.channel
         wanted = design.line * inputs + design.channel
@@ -195,7 +202,7 @@ class Measured(NamedTuple):
     """Indices of the candidates at these frequencies."""
     channel: int
     weight: float
-    """By which errors of these variances exceed those at power 1."""
+    """Factor by which errors with the variances of `htf` exceed the errors at power 1."""
 
 
 def measured_htfs(

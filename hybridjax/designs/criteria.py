@@ -1,4 +1,10 @@
-"""The criterion of each goal."""
+"""The criterion of each goal: which variance does a design minimize?
+
+`optimize.py` calls `criterion_of` with a goal (multipliers, parameters, responses) and models, and
+gets a `Criterion` (`criterion.py`). Each goal has a function here that computes the derivatives of
+measurements by the unknowns (`Channel`), and those of the wanted quantities. A further kind of goal
+is added in `criterion_of`.
+"""
 
 import dataclasses
 from collections.abc import Iterator
@@ -8,6 +14,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from .._core.arguments import require_among, require_index
+from .._core.text import number
 from ..errors import DefinitionError
 from ..fitting.fit import identifiability
 from ..fitting.observations import ObservedHTF
@@ -20,12 +27,12 @@ from .goals import Goal, MultiplierGoal, ParameterGoal
 from .matrices import ldtp_matrices, response_criterion
 
 
-# Exponents of the mean over models. Larger, for the worst one: closer to the largest criterion (of
-# ten models within 13 %), but the iteration takes shorter steps.
+# Exponents of the mean over models. With a larger one for "worst", the mean is closer to the
+# largest criterion (within 13 % for ten models now), but the iteration takes shorter steps.
 _EXPONENT = {"mean": 1.0, "worst": 16.0}
-# Relative size of the polynomial's slope below which a multiplier is not simple, and relative
-# distance at which multipliers of a minimal and of the whole model are the same. Larger: distinct
-# multipliers count as one. Smaller: rounding separates equal ones.
+# A multiplier is double if the relative slope of the polynomial is below this; multipliers of the
+# minimal and of the whole model are equal if their relative distance is below this. Larger:
+# distinct multipliers count as one. Smaller: rounding separates equal ones.
 _SAME = 1e-6
 
 
@@ -127,10 +134,9 @@ def wanted_parts(
             )
         powers = np.arange(d - 1, -1, -1)
         gradient = -(z**powers) / slope[k]
-        name = f"{z.real:.4g}"
+        name = number(z, 4)
         rows = [gradient.real]
         if z.imag != 0:
-            name += f"{z.imag:+.4g}j"
             rows.append(gradient.imag)
         if goal.part == "modulus":
             rows = [(z.conj() * gradient).real / abs(z)]

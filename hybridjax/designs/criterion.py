@@ -1,14 +1,18 @@
 r"""The variance of a quantity of interest as a function of the powers of the cosines.
 
-With powers p and errors of variance 1 at p = 1, the information about the unknowns $\theta$ is
-$J = \sum_k p_k F_k^T F_k$, and the variances of linear functions of $\theta$ are those of the
-Cramer-Rao bound. Unknowns of no interest (numerators) are projected out: then F depends on p, and
-is the part of the derivatives that numerators do not explain.
+With powers p and errors of variance 1 at p = 1, the information about the unknowns $\theta$ is $J =
+\sum_k p_k F_k^T F_k$, and the variances of linear functions of $\theta$ are those of the Cramer-Rao
+bound. Unknowns of no interest (numerators) are projected out. F is then the part of the derivatives
+that numerators do not explain, and depends on p.
 
-Every criterion $\Psi$ is convex in the powers, and halved where these are doubled. Of several
-models, the mean of r-th powers $(\frac{1}{J} \sum_j \Psi_j^r)^{1/r}$ has both properties for any
-$r \ge 1$, so that the certificate holds. With r = 1 it is the mean. With a large r it is hardly
-less than the largest one, by a factor of $J^{-1/r}$ at most.
+Every criterion $\Psi$ is convex in the powers, and twice the powers give half the criterion. For
+several models, the mean of r-th powers $(\frac{1}{J} \sum_j \Psi_j^r)^{1/r}$ has both properties
+for any $r \ge 1$, so that the certificate holds. With r = 1 it is the mean. With a large r it is
+nearly the largest one: it is smaller by a factor of $J^{-1/r}$ at most.
+
+The search calls `Criterion.bound(power)`, which returns a `Bound`: variances, sensitivities and the
+criterion. If the sensitivities are not the derivatives of the criterion, the search fails: test
+these first.
 """
 
 import dataclasses
@@ -41,14 +45,14 @@ class Channel(NamedTuple):
     cosine: Int[np.ndarray, " E"]
     """The candidate that each equation belongs to."""
     slopes: Float[np.ndarray, "E n"]
-    """Derivatives in units of standard deviations, for several entries: those by the first unknown
-    for all entries, then those by the second, ..."""
+    """Derivatives in units of standard deviations. The columns are, for all entries, the
+    derivatives by the first unknown, then those by the second, and so on."""
     basis: Float[np.ndarray, "E r"] | None = None
     """Orthonormal basis of the part that numerators can explain, at power 1; None: measurements
     depend on the unknowns directly, without numerators."""
 
     def only(self, kept: Kept) -> "Channel":
-        """Return the channel where only these cosines are applied, which are numbered anew."""
+        """Return the channel if only these cosines are applied. They get new numbers."""
         rows = np.flatnonzero(np.isin(self.cosine, kept))
         basis = None if self.basis is None else self.basis[rows]
         basis = powers_basis(basis)[0] if basis is not None and basis.size else basis
@@ -80,7 +84,7 @@ class LinearCriterion(eqx.Module):
     wanted: Float[np.ndarray, "rows d"]
     """Derivatives of the functions by the unknowns."""
     part: Int[np.ndarray, " rows"]
-    """The quantity that a row belongs to, whose variance is the sum over its rows."""
+    """The quantity that a row belongs to. (The variance of a quantity is the sum over its rows.)"""
 
     def only(self, kept: Kept) -> "LinearCriterion":
         channels = (channel.only(kept) for channel in self.channels)

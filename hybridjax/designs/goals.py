@@ -1,4 +1,9 @@
-"""The quantities of interest for which a design is optimized."""
+"""The quantities of interest for which a design is optimized: multipliers, physical parameters, or
+responses in a band.
+
+Users make a goal and give it to `optimal_design`. A goal has data only; its criterion is in
+`criteria.py`.
+"""
 
 from typing import Literal
 

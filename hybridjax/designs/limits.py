@@ -1,10 +1,12 @@
 r"""Limits of experiments: powers p of the cosines with $W p \le 1$ and $p^T Q p \le 1$.
 
-*Nonlinear distortion*, the even part of second order, is a quadratic form of the powers p. With
-many lines that is $p^T G p$, whose matrix is not positive semidefinite: lines whose products meet
-no resonance distort less together than their neighbors would. Designs are sought within the
-smallest convex bound of it that is found, $p^T Q p$ with $Q \succeq 0$ and $Q \succeq G$, and then
-scaled to the distortion of the very experiments.
+*Nonlinear distortion* (its even part of second order) is a quadratic form $p^T G p$ of the powers p
+of many lines. G is not positive semidefinite, so that this limit is not convex. Designs are sought
+within a convex bound, $p^T Q p$ with $Q \succeq 0$ and $Q \succeq G$ as small as possible, and then
+scaled to the true distortion of their experiments.
+
+`Limits` is what users give. `optimize.py` calls `power_limits` for the matrix W, `products` for G
+and Q, and `below_peaks` for the phases.
 """
 
 import dataclasses
@@ -27,15 +29,16 @@ from ..sections.second_order import Quadratic, second_order
 from .candidates import Candidates, Kept, Model, Powers, Squares
 
 
-# Lower bound of a cosine's price, relative to its price without negative terms. Larger: prices are
-# wrong where a few are negative. Smaller: powers without a positive price grow without bound.
+# Lower bound of a cosine's price, relative to the sum of its positive terms. Larger: prices with
+# negative terms are wrong. Smaller: powers without a positive price grow without bound.
 _LEAST = 1e-3
-# Relative difference of H_0 beyond which a system is not that of the model. Larger: sections of
-# another family pass (the hopper's two differ by 0.5 and more). Smaller: estimates are rejected.
+# A model belongs to a system if their H_0 differ by less than this part. Larger: models at other
+# sections pass (two families of the hopper differ by 0.5 and more). Smaller: estimated models are
+# rejected.
 _DIFFERENT = 0.3
 
 Words = Literal["input", "output"]
-# Squares of larger and smaller levels are infinite or zero.
+# (Squares of larger or smaller levels would be infinite or zero.)
 Level = Annotated[
     float, Number("a number from 1e-100 to 1e100", low=1e-100, high=1e100)
 ]
@@ -168,7 +171,7 @@ class PowerLimits(NamedTuple):
         self, power: Powers, level: Float[np.ndarray, " O"] | float = 1.0
     ) -> "PowerLimits":
         r"""Return linear limits, $p^T Q q \le \sqrt{p^T Q p}$, that all q within the quadratic ones
-        obey (Cauchy-Schwarz inequality): p itself uses both alike.
+        obey (Cauchy-Schwarz inequality): at p itself, both have the same value.
 
         **Arguments:** `level`: factor by which the quadratic forms may exceed 1. Default: 1.
         """
@@ -183,8 +186,8 @@ class PowerLimits(NamedTuple):
         return power / self.use(power).max()
 
     def price(self, prices: Float[np.ndarray, " L"]) -> Powers:
-        """Return the price of a unit of each cosine's power, which is positive even where the
-        tangent of a quadratic limit is not."""
+        """Return the price of a unit of each cosine's power. It is positive even if the tangent of
+        a quadratic limit has negative coefficients."""
         total = prices @ self.cost
         least = _LEAST * (prices @ np.abs(self.cost))
         return np.maximum(total, least)
@@ -272,7 +275,8 @@ def below_peaks(design: Design, peak: Mapping[str, float], seed: int) -> Design:
     phase = np.array(design.phase)
     for e in range(design.experiments):
         lines = np.flatnonzero(design.experiment == e)
-        # (Alone, so that a line that occurs in several experiments may have any phase.)
+        # (Each experiment alone, so that a line may have different phases in different
+        # experiments.)
         single = dataclasses.replace(
             design,
             experiment=0 * lines,
@@ -341,8 +345,9 @@ class Products(NamedTuple):
     def divided(
         self, kept: Kept, share: Float[np.ndarray, "E k"]
     ) -> Float[np.ndarray, "O k k"]:
-        """Return the expected mean square, in units of the limit, as a form of the mean powers of
-        cosines whose power in each experiment is a `share` of it."""
+        """Return the expected mean square of the distortion, in units of the limit, as a quadratic
+        form of the mean powers of the cosines. `share`: power of each cosine in each experiment,
+        relative to its mean power."""
         expected = self.expected[:, kept][:, :, kept]
         expected = expected / (self.level**2)[:, None, None]
         return expected * (share.T @ share) / len(share)
@@ -375,9 +380,9 @@ def products(
 
 
 def _convex(form: Float[np.ndarray, "K K"], unit: Powers) -> Float[np.ndarray, "K K"]:
-    """Return the nearest positive semidefinite matrix that exceeds the form by another such matrix,
-    in units of each cosine's power. (In units in which each alone distorts alike the bound of the
-    hopper is up to two times as large where power belongs.)"""
+    """Return the nearest positive semidefinite matrix whose difference from the form is positive
+    semidefinite, too. Distances are in units of each cosine's power, `unit`. (In units in which all
+    cosines distort equally, the hopper's bound would be up to twice as large.)"""
     scaled = form * unit[:, None] * unit
     values, vectors = np.linalg.eigh(scaled)
     positive = (vectors * np.maximum(values, 0)) @ vectors.T

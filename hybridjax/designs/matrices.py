@@ -1,7 +1,8 @@
 r"""Criteria of `fit_ldtp`, whose unknowns are the matrices of a linear periodic model.
 
-They are taken in the local coordinates of `fit_ldtp`, in combinations for which the information of
-the usual design is the identity; combinations that it does not determine are left out.
+`criteria.py` calls `ldtp_matrices` and `response_criterion`. Unknowns are the local coordinates of
+`fit_ldtp`, in those combinations for which the information of the usual design is the identity.
+Combinations that the usual design does not determine are left out.
 """
 
 import itertools
@@ -24,8 +25,8 @@ from .criterion import Channel, LinearCriterion
 from .goals import ResponseGoal
 
 
-# Part of a wanted variance that left-out combinations may have, at least. Larger: standard errors
-# are too small by half of it. Smaller: goals are rejected for rounding errors.
+# Combinations that are left out may contribute this part of a wanted variance. Larger: standard
+# errors are too small by half of this part. Smaller: goals are rejected for rounding errors.
 _MISSED = 0.05
 # Frequencies of a band at which its mean is taken. Fewer: the mean of a resonant curve is off.
 # More: longer computation.
@@ -165,7 +166,8 @@ def response_criterion(
         names.append(name if len(model.inputs) == 1 else f"{name} from {u}")
     each = slopes.transpose(1, 4, 5, 2, 3, 0)
     each = each.reshape(len(names), -1, matrices.coordinates.size)
-    # As few rows of each quantity as have the same sum of squares, up to rounding.
+    # (Rows of a quantity are combined to as few as possible, with the same sum of squares up to
+    # rounding.)
     _, values, vectors = np.linalg.svd(each, full_matrices=False)
     largest = values[:, :1] ** 2
     kept = values**2 > np.finfo(float).eps * largest

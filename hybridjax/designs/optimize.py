@@ -1,4 +1,11 @@
-"""The design that estimates a quantity of interest in the fewest cycles."""
+"""`optimal_design`: the design that estimates a quantity of interest in the fewest cycles.
+
+It takes the stages in order: cosines of the usual design (`candidates.py`), the criterion of the
+goal (`criteria.py`), limits (`limits.py`), the best powers (`allocation.allocate`), cosines that
+matter and their division into experiments (`worthwhile`, `to_design`), and phases within the peaks
+(`Rules`). It returns an `OptimalDesign` with a certificate. The certificate tells whether the
+powers are best; standard errors come from the criterion.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -42,8 +49,9 @@ from .limits import (
 )
 
 
-# Ratio of cycles from which on `advice` recommends the design. Larger: designs that save a third
-# are called nearly optimal. Smaller: savings within the uncertainty of the model are advertised.
+# `advice` recommends the design if it saves at least this factor of cycles. Larger: designs that
+# save a third are called nearly optimal. Smaller: savings within the uncertainty of the model are
+# advertised.
 _WORTH_IT = 1.5
 
 
@@ -101,7 +109,7 @@ class OptimalDesign(Showable, eqx.Module):
 
     @property
     def usual_name(self) -> str:
-        """The name of the design that it improves, in prints and figures."""
+        """The name of the design that was improved, in prints and figures."""
         size = self.usual.amplitude
         channel = self.usual.channel
         relative = size / (np.bincount(channel, size) / np.bincount(channel))[channel]
@@ -218,8 +226,8 @@ class Rules(NamedTuple):
         return dict(zip(self.distortion.names, rms, strict=True))
 
     def less_distorted(self, criterion: Criterion, design: Design) -> Design:
-        """Return the same cosines in the same experiments, with the best powers for the distortion
-        of just these, from those that they have. (That form is not convex, so that better ones may
+        """Return the same cosines in the same experiments, with powers that are improved for the
+        true distortion of these experiments. (This problem is not convex, so that better powers may
         exist.)"""
         if self.distortion is None:
             return design
@@ -358,7 +366,7 @@ def optimal_design(
     power = cosines.power_of(made)
     after = criterion.only(kept).bound(power[kept])
     shorter = usual.experiments / count
-    # Compared with all designs whose distortion is bounded as this one's is.
+    # (The certificate compares with all designs within the same convex bound of the distortion.)
     level = np.maximum(limits.use_of_curved(power), 1)
     excess = certify(ideal.bound, ideal.power, limits, level).excess
     return OptimalDesign(

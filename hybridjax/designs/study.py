@@ -1,4 +1,10 @@
-"""Studies: experiments block after block, until the estimate is as precise as requested."""
+"""`SequentialDesign`: experiments block after block, until the estimate is as precise as requested.
+
+A study has no model at first: `design` is the next block, and `add(data)` returns the study with
+the estimate from all blocks (`study_estimate.py`) and the optimal design for the missing cycles
+(`_next`). Studies are immutable. A study that never ends has its cause in `_suffices` or
+`_refuse_surplus`.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -29,11 +35,11 @@ from .optimize import OptimalDesign, optimal_design
 from .study_estimate import Block, Estimate, block_of, estimate, refuse_transient
 
 
-# A block has at most so many times the cycles of all before it. Larger: more cycles for a design
-# from a poor estimate. Smaller: more blocks.
+# A block has at most this many times the cycles of all blocks before it. Larger: more cycles for a
+# design from a poor estimate. Smaller: more blocks.
 _GROWTH = 2.0
-# Part by which a block is longer than predicted. Larger: too many cycles where the prediction was
-# right. Smaller: another block where it was a little too low.
+# A block is longer than predicted by this part. Larger: too many cycles if the prediction is right.
+# Smaller: another block if the prediction is a little too low.
 _SPARE = 0.05
 # Level of the confidence intervals whose widths are compared with the requested precision.
 _LEVEL = 0.95
@@ -289,7 +295,7 @@ class SequentialDesign(Showable, eqx.Module):
 
         plan = planned(self.limit)
         periods = self.first.periods
-        # Precisions of independent blocks add.
+        # (Inverse variances of independent blocks add.)
         now = (errors**2).sum()
         wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
         squares = (plan.standard_errors**2).sum()

@@ -1,4 +1,10 @@
-"""The estimate of the multipliers from all blocks of a study, whose noise is unknown."""
+"""The estimate of the multipliers from all blocks of a study, with unknown noise.
+
+`study.py` calls `block_of` for new data, `refuse_transient`, and `estimate` for all blocks
+together, which returns an `Estimate`: the fit, the noise of each block, and an objection if the fit
+cannot be used. The noise is estimated in turns with the fit: a wrong weight has its cause in this
+loop.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -32,11 +38,11 @@ from .allocation import ENOUGH
 from .goals import MultiplierGoal
 
 
-# Estimates of the noise, at most, each from the residual of a fit weighted by the last one. Fewer:
-# weights that are off by the signal in the first estimate.
+# Largest number of estimates of the noise, each from the residual of a fit that is weighted by the
+# last estimate. Fewer: the first estimate, which contains the signal, affects the weights.
 _SWEEPS = 10
-# Standard deviations by which a transient exceeds the noise before the data are rejected. Larger:
-# weak transients bias the multipliers. Smaller: noise is taken for a transient.
+# Data are rejected if a transient exceeds the noise by this many standard deviations. Larger: weak
+# transients bias the multipliers. Smaller: noise is taken for a transient.
 _BEYOND_NOISE = 3.0
 
 
@@ -83,7 +89,7 @@ def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
         data.outputs,
         variance=variance,
     )
-    # Frequencies may occur several times, measured each time on their own.
+    # (A frequency may occur several times, once for each measurement.)
     htf = eqx.tree_at(lambda htf: htf.frequencies, htf, from_host(line / P))
     cycles = data.u.shape[0] * data.u.shape[1] // N
     return Block(htf, cycles)
@@ -94,11 +100,11 @@ class Estimate(NamedTuple):
 
     fit: StructuredFit
     by_level: StructuredFit
-    """The same with the standard errors of white noise of these levels."""
+    """The same fit, with standard errors for white noise of these levels."""
     noise: Float[np.ndarray, "B ny"]
     """Standard deviation of each output's noise in each block."""
     supported: int
-    """How many of the fit's multipliers noise alone does not account for."""
+    """Number of multipliers of the fit that cannot be noise alone."""
     objection: str
     """The reason to reject the fit; empty if the data support it."""
 
@@ -115,19 +121,19 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
     A line that was measured in several experiments counts several times: the least-squares problem
     is that of the weighted mean. The noise level is one number for each block and output, from the
     residuals of all of its lines and harmonics (less the part that numerators take of it). With
-    hundreds of degrees of freedom it does not depend on the errors of single lines, as variances of
-    their own would, and does not bias.
+    hundreds of degrees of freedom it hardly depends on the errors of single lines. (A variance for
+    each line would depend on them, and bias the fit.)
 
     The standard errors are computed twice, and the larger ones are used: from the scatter of noise
-    and distortion at the lines that matter, valid for any spectrum of the noise, but uncertain
-    where these are few; and from the levels of the noise, as if it were white.
+    and distortion at the lines that matter, valid for any spectrum of the noise, but uncertain if
+    such lines are few; and from the levels of the noise, as if it were white.
     """
     htfs = to_host([block.htf for block in blocks])
     f = np.concatenate([x.frequencies for x in htfs])
     H = np.concatenate([x.H for x in htfs], axis=1)
     counts = [len(htf.frequencies) for htf in htfs]
     member = np.repeat(np.arange(len(blocks)), counts)
-    # To begin with, all of it may be noise.
+    # (At first, the whole response counts as noise.)
     relative = [np.abs(htf.H) ** 2 / htf.variance for htf in htfs]
     noise = np.sqrt([np.mean(x, axis=(0, 1, 3)) for x in relative])
     c = None
@@ -186,8 +192,8 @@ def estimate(blocks: tuple[Block, ...], order: int, goal: MultiplierGoal) -> Est
 
 
 def _objection(fit: MultiplierFit, most: int, order: int) -> str:
-    """Return why a fit of this order cannot be used, where the data support at `most` so many
-    multipliers; empty for one that can."""
+    """Return the reason why a fit of this order cannot be used; empty if it can. `most`: number of
+    multipliers that the data support."""
     if not most:
         return (
             "the data show no multiplier above the noise (if that remains so, take a first design "

@@ -1,6 +1,7 @@
-"""Types of arrays that have one entry for each of L lanes on their last axis.
+"""Names for the types of arrays in `engine`. The last axis has one entry for each of L lanes (a
+lane is one trajectory of many that are computed side by side).
 
-Each may be an array of either executor, which share the array API.
+These names stand in annotations only. Such an array may be one of NumPy or one of JAX.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,6 @@ Inputs = Float[Array, "nu L"]
 Mask = Bool[Array, " L"]
 Index = Int[Array, " L"]
 """A chart, a transition, a result code or a number of events for each lane."""
-# One entry for all lanes will do for these.
+# Types of arrays whose last axis may also have a single entry, which then holds for all lanes.
 AnyTimes = Float[Array, " #L"]
 AnyInputs = Float[Array, "nu #L"]

@@ -1,7 +1,10 @@
 """Zero crossings of the cubic Hermite interpolant of a guard over one step.
 
-The interpolant is cut at its extrema into at most three monotone pieces, so that the first
-crossing is found also where the guard dips below zero and returns within the step.
+`search/accept.py` calls `first_crossing` with the values and slopes of the guards at both ends of a
+step, and gets the first crossing as a fraction of the step. The interpolant is cut at its extrema
+into at most three monotone pieces, so that the first crossing is also found where the guard dips
+below zero and returns within the step. `search/attempt.py` calls `bounds` to see that a guard stays
+away from zero. An event that the search misses or invents has its cause in these two functions.
 """
 
 from typing import NamedTuple
@@ -15,13 +18,13 @@ from .arrays import Array
 # An extremum within this part of the guard's values at the step's ends is a touch. Higher: passing
 # near a guard is called grazing. Lower: grazing is missed.
 TOUCH = 1e-10
-# An extremum within this part of them is a near miss, for which the step is halved. Higher: more
-# steps. Lower: a guard that dips below zero within a step is missed.
+# An extremum within this part of the guard's values at the step's ends is a near miss: the step is
+# halved. Higher: more steps. Lower: a guard that dips below zero within a step is missed.
 NEAR = 1e-2
 
 
-# Points of a step at which a guard is compared with the error of its cubic. Fewer: it may fall
-# through zero between them where the cubic is far from it. More: time.
+# Points of a step at which the value of the cubic is compared with its error. Fewer: between two
+# points, the guard may fall through zero although the cubic does not. More: time.
 _POINTS = tuple(k / 8 for k in range(1, 8))
 
 
@@ -33,7 +36,7 @@ class CubicCrossing(NamedTuple):
     touch: Bool[Array, "*shape"]
     """The guard touches zero without a clear crossing."""
     near: Bool[Array, "*shape"]
-    """It comes so close to zero, before the first crossing, that the interpolant cannot be
+    """Before the first crossing, the guard comes so close to zero that the interpolant cannot be
     trusted."""
 
 
@@ -51,8 +54,8 @@ def first_crossing(
 ) -> CubicCrossing:
     """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
 
-    A guard that is not armed at the start counts only after it has become positive. Halfway it may
-    be as far from the cubic as the `margin`.
+    A guard that is not armed at the start counts only after it has become positive. `margin` is the
+    largest distance of the guard from the cubic halfway through the step.
     """
     xp = namespace(v1)
     cubic = _Cubic.of(v0, v1, d0, d1)
@@ -125,9 +128,10 @@ class _Cubic(NamedTuple):
         return self.d0 + s * (2 * self.b + s * 3 * self.c)
 
     def extrema(self) -> tuple[Array, Array]:
-        """Where the cubic has its extrema within (0, 1), in order; 1 for one that is not there.
+        """Positions of the two extrema within (0, 1), in order; 1 in place of an extremum outside
+        of (0, 1).
 
-        They are the roots of d0 + 2 b s + 3 c s^2, in the form that does not cancel.
+        Extrema are the roots of d0 + 2 b s + 3 c s^2, computed without cancellation.
         """
         _, d0, b, c = self
         xp = namespace(b)
@@ -144,8 +148,8 @@ class _Cubic(NamedTuple):
 
 
 def _beside(s, margin):
-    """The distance at s of a function from its cubic interpolant that is the margin at 1/2: zero to
-    second order at the ends."""
+    """The largest distance of a function from its cubic interpolant at s, if this distance is
+    `margin` at s = 1/2. It is zero to second order at both ends."""
     return 16 * (s * (1 - s)) ** 2 * margin
 
 
@@ -181,8 +185,12 @@ def halfway_cubic(q0, q1, f0, f1, h) -> tuple[Array, Array]:
 
 
 def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
-    """Bounds of a function over a step that is as far from its cubic interpolant as the margin: the
-    Bernstein coefficients of the quartics that are so far from it halfway."""
+    """Lower and upper bound of a function over a step, if its distance from its cubic interpolant
+    halfway is at most `margin`.
+
+    They are the extreme Bernstein coefficients of the two quartics that have this distance from the
+    cubic halfway.
+    """
     xp = namespace(v1)
     first = v0 + d0 / 4
     last = v1 - d1 / 4

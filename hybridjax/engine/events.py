@@ -1,6 +1,10 @@
 """Events: arming of guards, resets, schedules, and the accumulation of events (Zeno).
 
-Derivatives across an event (saltation) come from `watch.ChartFlow.locate` and `replay.py`.
+A guard is *armed* if its next fall through zero is an event. The search calls these functions:
+`arm` at the start of a flow, `rearm` and `apply_resets` at an event, `next_schedule` before each
+step and `keep_pace` after it. All take lanes (trajectories side by side), and return arrays of the
+same lanes. An event that happens twice, or not at all after a reset, has its cause in `rearm`.
+Derivatives across an event (saltation) are computed in `watch.ChartFlow.locate` and `replay.py`.
 """
 
 import itertools
@@ -20,24 +24,27 @@ from .settings import ROUNDING
 from .watch import Watch
 
 
-# An instant, as a part of the time allowed: shorter steps are not taken, and a watched function
-# counts as zero if its rate would have made its value in an instant. Higher: separate events are
-# taken for simultaneous ones. Lower: simultaneous ones for separate ones.
+# An instant, as a part of the time allowed for the flow. Events within an instant are simultaneous.
+# A watched function counts as zero if it would reach zero in an instant at its present rate.
+# Higher: separate events are taken for simultaneous ones. Lower: simultaneous ones for separate
+# ones.
 INSTANT = 1e-12
-# Events accumulate (Zeno) if this many intervals between them in a row shrink, and the sum of the
-# intervals to come (as a geometric series) is at most this part of the sum so far. Higher and
-# lower: it is reported later, after more events. Lower and higher: a transient may be taken for it.
+# Events accumulate (Zeno) if `_ZENO_STREAK` intervals between events in a row shrink, and if the
+# sum of the intervals to come (as a geometric series) is at most the part `_ZENO_REST` of the sum
+# so far. A longer streak or a smaller part: Zeno is reported after more events. A shorter streak or
+# a larger part: a transient may be taken for Zeno.
 _ZENO_STREAK = 10
 _ZENO_REST = 1e-3
-# A guard that is crossed at a vanishing speed after this many shrinking intervals is Zeno, too.
-# Higher: it is called grazing instead. Lower: a grazing is called Zeno.
+# A crossing at a vanishing speed counts as Zeno after this many shrinking intervals, and as a
+# grazing before. Higher: Zeno is called grazing. Lower: a grazing is called Zeno.
 _ZENO_SLOW = 3
 
 
 def width(
     t: Float[Array, " #L"], span: Times, rate: Float[Array, "W L"]
 ) -> Float[Array, "W L"]:
-    """Values of watched functions that count as zero: their change in a time of rounding errors."""
+    """The magnitude below which the value of a watched function counts as zero: its change during
+    the rounding error of a time."""
     xp = namespace(rate)
     return (INSTANT * span + ROUNDING * xp.abs(t)) * xp.abs(rate)
 
@@ -45,8 +52,8 @@ def width(
 def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
     """Arm the guards that are positive at the beginning of a piece of flow.
 
-    A guard that its input, which may have jumped, makes negative is crossed by no motion: it is
-    no event, and not armed until it is positive again.
+    If a jump of the input makes a guard negative, no motion has crossed it. This is no event, and
+    the guard is not armed until it is positive again.
     """
     zero = width(lanes.t, span, watched.rate)
     is_above = (watched.value > zero)[:-1]
@@ -60,7 +67,8 @@ def arm(s: Structure, lanes: Lanes, watched: Watch, span: Times) -> Lanes:
 def with_schedules(
     s: Structure, armed: Bool[Array, "G L"], scheduled: Bool[Array, "G L"]
 ) -> Bool[Array, "G L"]:
-    """`armed` of guards, and of `scheduled` events, in every chart."""
+    """The flags `armed` in every chart: those of guards as they are, those of scheduled events from
+    `scheduled`."""
     by_clock = (s.clocks >= 0)[:, None]
     return namespace(armed).where(by_clock, scheduled, armed)
 
@@ -68,9 +76,12 @@ def with_schedules(
 def await_schedules(
     s: Structure, armed: Bool[Array, "G L"], before: Times, t: Times
 ) -> Bool[Array, "G L"]:
-    """`armed` after a step from `before` to t, with all scheduled events but those that are due at
-    both times: an event that has happened is not armed until its time is over, so that it happens
-    once; another one that is due at the same time is still to come."""
+    """The flags `armed` after a step from `before` to t, with all scheduled events armed but those
+    that are due both at `before` and at t.
+
+    A scheduled event that has happened is not armed again until its time is over, so that it
+    happens once. Another event that is due at the same time is still to come.
+    """
     xp = namespace(t)
     for g, transition in enumerate(s.transitions):
         if isinstance(transition.guard, Scheduled):
@@ -82,14 +93,15 @@ def await_schedules(
 
 
 def falls_within(value: Array, rate: Array, time: Array) -> Array:
-    """Test whether watched functions are at zero, up to their change in a time, and fall."""
+    """Test whether watched functions fall, and are closer to zero than they move in `time`."""
     return (abs(value) <= time * abs(rate)) & (rate < 0)
 
 
 def overdue(watched: Watch, t: Times, span: Times) -> Bool[Array, "G L"]:
-    """Guards that are beyond zero at t, by more than rounding errors of times.
+    """Guards that are below zero at t by more than they move during rounding errors of times.
 
-    A piece of flow between two events at the same time has no `span`: that of its clock is left.
+    Between two events at the same time `span` is zero; the rounding error of t itself is still
+    allowed.
     """
     late = SAME_TIME * span + ROUNDING * abs(t)
     value = watched.value[:-1]
@@ -102,8 +114,8 @@ def rival_of(
 ) -> Index:
     """The guards (by index; -1: none) that come to zero where the events `fired` happen, too.
 
-    If the reset of an event puts the other guard away from zero, only one of the two happens, and
-    rounding has decided which.
+    If the reset of one event moves the other guard away from zero, only one of the two events
+    happens, and rounding decides which one.
 
     **Arguments:** `lanes`, `watched`: before the resets.
     """
@@ -121,11 +133,12 @@ def rival_of(
 def due_at_once(
     s: Structure, lanes: Lanes, watched: Watch, u: Inputs, span: Times
 ) -> Index:
-    """The transitions (by index; -1: none) whose events are due at once where lanes are: armed
-    guards that are beyond zero, or at it and fall, and scheduled events that have not happened yet.
+    """The transitions (by index; -1: none) whose events are due at once at the present states of
+    lanes. These are armed guards below zero, armed guards that fall at zero, and scheduled events
+    that are due and have not happened yet.
 
-    A flow that begins there does not know of them: `arm` takes a guard beyond zero for one that the
-    input has led there.
+    A flow that begins at these states would miss these events: `arm` supposes that a guard below
+    zero was made negative by the input.
     """
     t = lanes.t
     clock = s.clocks[:, None]
@@ -162,19 +175,22 @@ def _first_enabled(
 
 
 def belongs(s: Structure, chart: Index) -> Bool[Array, "W L"]:
-    """Test whether rows of a `Watch` belong to the chart of each lane (the target's row does)."""
+    """Test whether rows of a `Watch` belong to the chart of each lane. The target's row always
+    does."""
     sources = [s.chart_index(transition.source) for transition in s.transitions]
     source = np.array([*sources, -1])[:, None]
     return (source == chart) | (source == -1)
 
 
 class Entry(NamedTuple):
-    """The guards of the charts that lanes enter, as far as the charts before had them, too."""
+    """Guards of the charts that lanes enter, compared with the guards of the charts that they
+    leave."""
 
     known: Bool[Array, "G L"]
-    """Whether the chart before has this guard: in the same chart, or with the same value."""
+    """Whether the chart before has the same guard: it is the same chart, or its guard has the same
+    value."""
     armed: Bool[Array, "G L"]
-    """Whether that guard was armed."""
+    """Whether the guard was armed in the chart before."""
 
 
 def rearm(
@@ -189,13 +205,14 @@ def rearm(
 ) -> Lanes:
     """Arm the guards of the charts that lanes have just entered through the transitions `fired`.
 
-    A guard that is zero there, up to rounding and to the `residue` of the guard that fired, waits
-    until it has left zero, if it rises, or if it was crossed before (see `Entry`). Otherwise the
-    reset has put it there, or it has come to zero together with the guard that fired, and it is due
-    at once if it falls.
+    A guard that is zero right after the reset (up to rounding and the `residue` of the guard that
+    fired) is not armed if it rises, or if it was crossed before (see `Entry`): it waits until it
+    has left zero. Otherwise the reset has put it at zero, or it came to zero together with the
+    guard that fired: it is due at once if it falls.
 
-    A guard that is beyond zero is due at once (see `overdue`) if it was armed in the old chart, so
-    that the reset has led across it, or if it falls, and the old chart does not have it.
+    A guard that is below zero right after the reset (see `overdue`) is due at once in two cases: it
+    was armed in the old chart, so that the reset has led across it; or the old chart does not have
+    it, and it falls.
     """
     xp = namespace(fired)
     value = watched.value[:-1]
@@ -217,8 +234,8 @@ def rearm(
 
 
 def _over(s: Structure, t: Times, fired: Index) -> Bool[Array, "G L"]:
-    """Scheduled events that are over after the transitions `fired` at t: those of the same clock,
-    and of clocks of the same period, those that belong to an earlier period."""
+    """Scheduled events that are over once the transitions `fired` have happened at t: those of the
+    same clock, and, of clocks with the same period, those that belong to an earlier period."""
     xp = namespace(t)
     G = len(s.transitions)
     over = xp.zeros((G, t.shape[0]), bool)
@@ -302,7 +319,8 @@ def enabled(s: Structure, t: Times, q: Padded, u: Inputs, which: Index) -> Mask:
 
 
 def _within(kind: Kind, g: Index) -> tuple[Mask, Int[Array, " #L"]]:
-    """Test whether the transitions g (-1: none) are of a kind, and their indices there (else 0)."""
+    """Test whether the transitions g (-1: none) are of a kind (see `Structure`), and return their
+    indices within the kind (0 for others)."""
     xp = namespace(g)
     if len(kind) == 1:
         first = xp.asarray(np.zeros(1, np.int32))
@@ -319,8 +337,8 @@ def next_schedule(
 ) -> tuple[Times, Index]:
     """Time of the next scheduled event (infinity if there is none), and its transition.
 
-    Times that differ by rounding are one: an event that is due at t comes at once if it is `armed`
-    (it has not happened at t), and one that is due at `end` happens at `end`.
+    Times that differ by rounding count as equal. An event that is due at t happens at once if it is
+    `armed`, that is, if it has not happened at t. An event that is due at `end` happens at `end`.
     """
     xp = namespace(t)
     best = xp.full_like(t, xp.inf)
@@ -338,7 +356,7 @@ def next_schedule(
         time = xp.where(now, xp.maximum(past, t), later)
         at_end = xp.abs(time - end) <= same_time
         time = xp.where(at_end, end, time)
-        # (Of several that are due now, the one of an earlier period is first.)
+        # (If several events are due now, the event of an earlier period comes first.)
         rank = xp.where(now, k, xp.inf)
         is_before = (time == best) & (rank < first)
         sooner = (time < best) | is_before
@@ -350,8 +368,8 @@ def next_schedule(
 
 
 def scheduled_time(s: Structure, fired: Index, t: Times) -> Times:
-    """Time of the scheduled event `fired` that lies at t up to rounding, as a smooth function of
-    its period and offset; t itself for other events."""
+    """Time of the scheduled event `fired`, which is t up to rounding, as a differentiable function
+    of the period and offset of its schedule. For other events, t itself."""
     xp = namespace(t)
     time = t
     for g, transition in enumerate(s.transitions):
@@ -371,13 +389,13 @@ def keep_pace(
     """Intervals between events (see `Lanes.pace`), and whether events accumulate: the intervals
     shrink with a sum that converges.
 
-    `slow` marks events whose guard is crossed at a vanishing speed. So many different `transitions`
-    may coincide without accumulating.
+    **Arguments:** `slow`: events whose guard is crossed at a vanishing speed. `transitions`: number
+    of different transitions, which may all happen at one time without accumulating.
     """
     xp = namespace(pace)
     since, gap, streak, total = pace
     since = since + moved
-    # (Events at one time, which take each other's place, are apart by rounding.)
+    # (Different events at one time differ by rounding errors only.)
     at_one_time = event & (since <= INSTANT * span)
     since = xp.where(at_one_time, 0.0, since)
     ratio = since / xp.where(gap > 0, gap, 1.0)

@@ -1,8 +1,11 @@
-"""Flow of many lanes to their targets with the events on the way, differentiable.
+"""Flow of many lanes (trajectories side by side) to their targets, with the events on the way and
+states at given times, differentiable.
 
-As in `move.py`, values are those of a search, and derivatives those of the replay of its tape
-(`_passed_jvp`). In addition, events (`_events`) and states at given times (`_samples`) are read
-from the tape, and get their derivatives in the same way.
+`pass_through` is the function that `orbits/flow.py` calls, inside of its compiled programs. As in
+`move.py`, values are those of a search, and derivatives are those of a replay of the tape (the
+record of the search's steps); `_passed_jvp` joins the two. Here, `_events` and `_samples` also read
+events and states at given times from the tape. If an event or a sample is wrong and the end of the
+flow is right, look in these two.
 """
 
 import functools as ft
@@ -36,7 +39,8 @@ from .target import Target, until
 
 
 class Events(NamedTuple):
-    """The first E events of L lanes. What has not happened has the transition -1 and NaN."""
+    """The first E events of L lanes. An event that has not happened has the transition -1 and times
+    and states of NaN."""
 
     transition: Int[Array, "E L"]
     t: Float[Array, "E L"]
@@ -45,23 +49,24 @@ class Events(NamedTuple):
     after: Float[Array, "E d L"]
     at_once: Bool[Array, "E L"]
     rival: Int[Array, "E L"]
-    """Both as on the `Tape`."""
+    """Another event at the same time: see `Tape`. `at_once`, too, is as on the `Tape`."""
 
     @property
     def smooth(self) -> tuple:
-        """Times, and states before and after: those that have derivatives."""
+        """The fields that have derivatives: times, and states before and after the events."""
         return self.t, self.before, self.after
 
 
 class Samples(NamedTuple):
-    """Charts and states of L lanes at K times of each; NaN before the start and after the end."""
+    """Charts and states of L lanes at K given times of each lane; NaN before the start and after
+    the end of the flow."""
 
     chart: Int[Array, "K L"]
     q: Float[Array, "K d L"]
 
 
 class Passage(NamedTuple):
-    """Lanes at their targets, the events on the way, and samples of it."""
+    """Lanes at their targets, the events on the way, and states at given times on the way."""
 
     moved: Moved
     events: Events
@@ -79,8 +84,8 @@ def pass_through(
     times: Float[Array, "K L"],
     result: Index,
 ) -> Passage:
-    """Flow every lane to its target under a constant input, as `move` does. Those whose `result`
-    is not OK stay where they are.
+    """Flow every lane to its target under a constant input, as `move` does. Lanes whose `result` is
+    not OK stay where they are.
 
     Times and states of the end, of the events and at the `times` have exact derivatives of first
     and second order with respect to all floating-point arrays: states, times, inputs, parameters,
@@ -141,8 +146,8 @@ def _passed_jvp(primals, tangents):
 
 
 def _with_values(passage: Passage, values: Any) -> Passage:
-    """A passage with these values, or their tangents: the times and states of the ends, what is
-    smooth of the events, and the states of the samples."""
+    """Replace the differentiable fields of a passage by `values` (or by tangents): times and states
+    of the ends, `Events.smooth`, and the states of the samples."""
 
     def places(passage):
         lanes = passage.moved.lanes
@@ -159,8 +164,8 @@ def _samples(
     ways: Ways,
     times: Float[Array, "K L"],
 ) -> Samples:
-    """The states at some times, by a step from the end of the last move before each. Those outside
-    of the flow have no meaning."""
+    """The states at `times`, each by one step from the end of the last move before it. States at
+    times outside of the flow have no meaning."""
     K, L = times.shape
     if not K:
         no_charts = jnp.zeros((0, L), jnp.int32)
@@ -187,8 +192,8 @@ def _samples(
 def _is_within(
     times: Float[Array, "K L"], lanes: Lanes, end: Times
 ) -> Bool[Array, "K L"]:
-    """Test whether times lie between the start and the end, which other programs know but for
-    rounding."""
+    """Test whether times lie between the start and the end of the flow, up to rounding: a time that
+    another program has computed may differ by rounding."""
     times, start, end = jax.lax.stop_gradient((times, lanes.t, end))
     duration = end - start
     late = INSTANT * duration + ROUNDING * jnp.abs(end)
@@ -196,7 +201,8 @@ def _is_within(
 
 
 def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) -> Lanes:
-    """The lanes where the moves begin within which the times lie, K of each one after the other."""
+    """For each of the K times of a lane, the state at the beginning of the move in which the time
+    lies. The K states of a lane follow each other."""
     rows = jnp.arange(len(tape.code))[:, None]
     is_move = tape.code != IDLE
     # (The last move that ends before each time; -1 for none.)
@@ -234,7 +240,7 @@ def _recorded(s, lanes, u, target, settings, options, result) -> tuple[Moved, Ta
 def _events(tape: Tape, ways: Ways, most: int) -> Events:
     """The first events on a tape, with times and states from the ends of its moves."""
     number = jnp.arange(1, most + 1, dtype=jnp.int32)
-    # The row in which the count of events reaches each number.
+    # The row of the tape in which the number of events reaches 1, 2, and so on.
     first = ft.partial(jnp.searchsorted, v=number)
     row = jax.vmap(first, in_axes=1, out_axes=1)(tape.events)
     row = jnp.minimum(row, len(tape.events) - 1)

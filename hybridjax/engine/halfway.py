@@ -1,9 +1,10 @@
-"""The state and its rate halfway through a Runge-Kutta step, from the stages that the step has.
+"""Weights by which a Runge-Kutta step computes the state and its rate halfway through the step.
 
-The cubic Hermite interpolant of a step knows its ends only. Weights of the stages that satisfy the
-order conditions at half the step (E. Hairer, S. P. Norsett and G. Wanner, Solving Ordinary
-Differential Equations I, section II.6) tell how far the solution is from that cubic, without a
-further evaluation of the field.
+`runge_kutta.py` asks for them with `halfway(method)`, once for each method. The cubic Hermite
+interpolant of a step uses the ends of the step only. The state halfway, which the weights give
+without a further evaluation of the field, tells how far the solution is from that cubic. The
+weights satisfy the order conditions at half the step (E. Hairer, S. P. Norsett and G. Wanner,
+Solving Ordinary Differential Equations I, section II.6).
 """
 
 import functools as ft
@@ -17,15 +18,16 @@ from jaxtyping import Bool, Float
 from ..systems.solver import Method
 
 
-# The orders of weights, the best first. Higher: methods of order 7 have too few stages for it.
-# Lower: the cubic is as accurate.
+# Orders of weights to try, the highest first. Above 5: methods of order 7 have too few stages.
+# Below 3: the cubic is as accurate.
 _ORDERS = (5, 4, 3)
-# Order conditions of the highest order may be violated by this: the default method misses them by
-# 1.1e-4, where the cubic misses them by 5e-4. Higher: weights are as wrong as the cubic. Lower: the
-# order of weights is lower.
+# Conditions of the highest order may be violated by this much. (The default method violates them by
+# 1.1e-4, the cubic by 5e-4.) Higher: weights may be as inaccurate as the cubic. Lower: weights of
+# lower order are used instead.
 _VIOLATED = 2e-4
-# Conditions of lower orders weigh so much more. Higher: rounding errors. Lower: weights violate
-# them, too, and their error does not vanish with the step.
+# How much more the conditions of lower orders count in the least-squares problem than those of the
+# highest order. Higher: rounding errors. Lower: the conditions of lower orders are violated, too,
+# and the error does not vanish for short steps.
 _FIRST = 1e5
 # Weights of the state are no larger than this. Higher: errors of the stages are larger halfway than
 # those of the cubic (Kvaerno5). Lower: the order of weights is lower.
@@ -42,21 +44,23 @@ class Halfway(NamedTuple):
     """Weights of the stages of a step."""
 
     state: tuple[float, ...]
-    """Of the change of the state until halfway, as a part of the step."""
+    """Weights that give the change of the state from the start until halfway, in units of the step
+    length."""
     rate: tuple[float, ...]
-    """Of the rate halfway."""
+    """Weights that give the rate halfway."""
 
 
 @ft.lru_cache
 def halfway(method: Method) -> Halfway | None:
-    """The weights of a method; `None` if it has no order of 3, and is no more accurate than the
-    cubic."""
+    """The weights of a method; `None` if there are none of order 3 or more, so that they would be
+    no more accurate than the cubic."""
     a = np.array(method.a)
     every = np.ones(len(method.b), bool)
     if method.implicit:
-        # (An explicit stage of a stiff chart may be large where a fast mode has been excited.)
+        # (Of an implicit method, explicit stages are not used: in a stiff chart they are large
+        # where a fast mode has been excited.)
         every = np.diag(a) != 0
-    # (Fewer stages, if these are enough: each takes time in every step.)
+    # (As few stages as possible, since each one takes time in every step.)
     cheap = every & (np.array(method.b) != 0)
     for order, usable in product(_ORDERS, (cheap, every)):
         weights = _weights(a, usable, order)
@@ -94,13 +98,13 @@ def _weights(
 
 @ft.lru_cache
 def _trees(size: int) -> tuple[Tree, ...]:
-    """All rooted trees of so many nodes."""
+    """All rooted trees with `size` nodes."""
     trees = (tuple(sorted(x)) for x in _forests(size - 1))
     return tuple(dict.fromkeys(trees))
 
 
 def _forests(size: int) -> list[Tree]:
-    """Rooted trees that have so many nodes together, in any order."""
+    """All sets of rooted trees that have `size` nodes together."""
     if size == 0:
         return [()]
     found: list[Tree] = []

@@ -1,14 +1,18 @@
-"""Users' functions for code that runs on the host, each with its first derivatives.
+"""Users' functions (fields, guards, resets, outputs) compiled one by one, for code that runs on the
+host, each with its first derivatives.
 
-`watched`, `reset`, `enabled` and `linear` also take and return arrays of JAX, the others NumPy's. A
-column of values stands before those of derivatives, by the time, the n states and the inputs:
-(rows, 2 + n + nu, L). Where only `some` lanes are needed, the others are copies of one of these;
-one lane may stand for all.
+The engine on the host calls `field`, `step`, `watched`, `reset` and so on with arrays of NumPy
+whose last axis has the lanes (trajectories side by side). An answer has one column for the value,
+then columns for the derivatives by the time, the n states and the nu inputs: (rows, 2 + n + nu, L).
+`watched`, `reset`, `enabled` and `linear` also take and return arrays of JAX. With a mask `some`,
+only these lanes are computed, and the other lanes hold copies of one of them.
 
-The file has three parts: what the engine asks for (`field` to `levels`), the functions of a single
-point behind them (`_field` to `_levels`), and the forms in which they are computed for lanes:
-`_expanded` with derivatives, `_ByMethod` in steps, `_Tangent` along directions (`Tangents`),
-`_BySystem` for many systems (`Systems`).
+The file has three parts: the functions that the engine calls (`field` to `levels`); behind them,
+the functions of a single point (`_field` to `_levels`); and *forms*, which turn a function of a
+point into a compiled function of lanes. The forms are `_expanded` (with derivatives), `_ByMethod`
+(in steps), `_Tangent` (along directions, for `Tangents`) and `_BySystem` (for many systems,
+`Systems`). If derivatives of all functions are wrong, look first at the forms; if those of one
+function are wrong, at its function of a point.
 """
 
 import copy
@@ -38,11 +42,11 @@ Expanded = Float[Array, "rows columns L"]
 Some = Bool[Array, " L"] | None
 Items = tuple[str | Output, ...]
 
-# Lanes of programs that are called for many points at once. Higher: single points wait for lanes
-# that nobody needs. Lower: many points take more calls.
+# Number of lanes of the programs that are called for many points at once. Higher: calls for few
+# points compute unused lanes. Lower: many points take more calls.
 POINTS = 16
-# Lanes of programs for systems or directions side by side. More: the last call has more empty
-# lanes. Fewer: calls cost more than they compute.
+# Number of lanes of the programs for many systems or many directions. More: the last call has more
+# unused lanes. Fewer: calling costs more than computing.
 WIDE = 256
 
 
@@ -78,7 +82,8 @@ def step_along(
     along: States,
     some: Some,
 ) -> tuple[Step, States, States]:
-    """A step in chart a, and the derivatives of its end and of its estimate along a direction."""
+    """A step in chart a, and the derivatives of its end and of its error estimate along a direction
+    of states."""
     method = _ByMethod(_step_along, s.method(a))
     of_lanes = s.kernel(_field, method, a)
     *step, end, estimate = of_lanes(t, q, u, h, along, some=some)
@@ -111,7 +116,7 @@ def watched(
         of_point = _columns(ft.partial(watched_at, *static))
         return s.by_lane(of_point, levels)(t, q, u, index)
     if lanes is None:
-        # (A program for many points is worth its compilation from so many calls on.)
+        # (Compiling a program for many points pays only if there are many points.)
         lanes = 1 if q.shape[-1] < 4 * POINTS else POINTS
     rows = s.kernel(watched_at, _expanded, *static, trees=(levels,), lanes=lanes)
     return rows(t, q, u, index.astype(np.int32), some=some)
@@ -140,12 +145,14 @@ def enabled(
 
 
 def due(s: Structure, g: int, t: Times, q: States, u: Inputs) -> Expanded:
-    """The time from t to that of a scheduled transition up to rounding, and its derivatives."""
+    """The time from t to the nearest scheduled time of a transition, with its derivatives. (Callers
+    are at such a time already, so that the value is a rounding error.)"""
     return s.kernel(_due, _expanded, g)(t, q, u)
 
 
 def by_parameter_of_period(s: Structure) -> Any:
-    """The derivative of the period of a clock by the only input, which is added to a parameter."""
+    """The derivative of the clock's period by a parameter. (The only input of `s` is added to this
+    parameter.)"""
     if is_traced(s):
         by_input = jax.jacfwd(lambda u: _period(s, 0.0, 0.0, u))
         return by_input(jnp.zeros(1))[0, 0]
@@ -190,8 +197,8 @@ def levels(
     return rows(t, q)
 
 
-# Functions of a point, by what is static, the structure, and other trees. (They belong to the
-# module, so that a program is the same whenever it is asked for.)
+# Functions of a point. Static arguments come first, then the structure, then other trees. (They are
+# functions of the module, so that their compiled programs are found again.)
 
 
 def _field(a: int, s: Structure, t, q, u, *_):
@@ -208,7 +215,8 @@ def watched_at(
     u,
     i,
 ):
-    """The guards of chart a, of these kinds, and the level of section i if the chart has one."""
+    """The guards of chart a, given by their kinds, and the level of section i if the chart has
+    one."""
     guards = s.guard_values(kinds, t, q, u)
     if levels is not None and levels.present(s, a):
         guards = [*guards, levels.level(s.under(u), a, i, t, q)]
@@ -253,7 +261,7 @@ def _levels(a: int, n_sections: int, s: Structure, levels: AbstractLevels, t, q)
     return jnp.stack(jax.vmap(along)(indices), axis=1)
 
 
-# Forms: what is computed of a function, for lanes.
+# Forms: from a function of a point to a function of lanes.
 
 
 def _expanded(function: Callable, *trees: Any) -> Callable:
@@ -289,11 +297,13 @@ def _columns(function: Callable, trees: int = 2) -> Callable:
 
 
 class Tangents(Structure):
-    """A structure whose numbers, and those of `levels`, move in P directions, for complex lanes of
-    the host: the derivatives of their real parts, times `TINY`, are their imaginary parts.
+    """A structure for derivatives in P directions, in which parameters of the system and of
+    `levels` change.
 
-    Its functions take the inputs `unpushed`. Trees of directions have arrays (P, ...), or `None`
-    for what does not move.
+    Each lane has one of the P directions. States and times of a lane are complex: the real part is
+    the value, and the imaginary part is its derivative along the direction, times `TINY`. Inputs
+    have P more rows, which say which direction a lane has (see `pushed`). A tree of directions has
+    arrays (P, ...), or `None` for a number that does not change.
     """
 
     def __init__(
@@ -309,7 +319,9 @@ class Tangents(Structure):
         self.moving = sum(x.reshape(directions, -1).any(axis=1) for x in leaves) > 0
 
     def pushed(self, direction: Int[np.ndarray, " L"]) -> Inputs:
-        """Inputs of zero, and the directions of lanes; of negative index, none."""
+        """Inputs for lanes with these directions: the system's own inputs, all zero, then P rows
+        with a 1 in the row of the lane's direction. (A negative index gives zeros: no
+        direction.)"""
         along = np.arange(self.directions)[:, None] == direction
         still = np.zeros((self.nu, len(direction)))
         return np.concatenate([still, along])
@@ -343,7 +355,8 @@ class Tangents(Structure):
 
 
 class Systems(Structure):
-    """Systems in lanes of the host, whose arrays have the lanes on a last axis."""
+    """Many systems of one class, one in each lane on the host. Arrays of parameters have the lanes
+    on their last axis."""
 
     by_system = True
 
@@ -379,7 +392,7 @@ class Systems(Structure):
 
 
 class _BySystem(NamedTuple):
-    """A form for systems in lanes, whose numbers are the rows of the first argument."""
+    """A form for many systems: the first argument has their parameters, one row for each system."""
 
     form: Callable
 
@@ -400,12 +413,15 @@ class _BySystem(NamedTuple):
         return lanes
 
 
-# Scale of tangents as imaginary parts. Their products vanish beside real parts.
+# Scale of derivatives as imaginary parts, so small that products of two of them vanish beside the
+# real parts.
 TINY = np.sqrt(np.finfo(float).tiny)
 
 
 def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
-    """Inputs of lanes of the host without any input."""
+    """Inputs that are zero, for lanes with these indices. For `Tangents`, they say which direction
+    each lane has: lanes take turns, first the 1 + d directions of time and states, then the P of
+    parameters."""
     if not isinstance(s, Tangents):
         return np.zeros((s.nu, len(lane)))
     n = 1 + s.d  # directions of the start of a move come first
@@ -413,7 +429,8 @@ def unpushed(s: Structure, lane: Int[np.ndarray, " L"]) -> Inputs:
 
 
 def parted(tree: Any) -> tuple[Any, Any]:
-    """Complex arrays (N, P, ...) as values (N, ...) and derivatives (P, N, ...)."""
+    """Split complex arrays (N, P, ...) (see `Tangents`) into values (N, ...) and derivatives (P, N,
+    ...)."""
 
     values = jax.tree_util.tree_map(lambda x: x.real[:, 0], tree)
     derivatives = jax.tree_util.tree_map(
@@ -423,7 +440,8 @@ def parted(tree: Any) -> tuple[Any, Any]:
 
 
 class _Tangent(NamedTuple):
-    """A form, and its derivative along tangents of the arguments `moving` and of all trees."""
+    """Another form, with its derivative along tangents of the arguments `moving` and of all
+    trees."""
 
     form: Callable
     moving: tuple[int, ...]
@@ -454,7 +472,7 @@ class _Tangent(NamedTuple):
 
 
 class _ByMethod(NamedTuple):
-    """Lanes of what a Runge-Kutta method computes of a field, from (t, q) over h under u."""
+    """Lanes of a function of a Runge-Kutta step: of the method, the field, and (t, q, u, h)."""
 
     compute: Callable
     method: Method
@@ -468,7 +486,7 @@ def _step(method: Method, field: Callable, t, q, u, h, *x):
     def at(t, q):
         return field(t, q, u, h, *x)
 
-    # (With directions x it is differentiated.)
+    # (With directions x, the step will be differentiated.)
     return jnp.stack(take_step(method, at, t, q, h, still=at if x else None))
 
 

@@ -1,15 +1,16 @@
-"""Lanes: the hybrid states of many trajectories that move side by side; the tape of their moves.
+"""Lanes: the hybrid states of many trajectories that are computed side by side; and the tape, the
+record of their moves. A *move* is one accepted step, with the event at its end if there is one.
 
 `Lanes` is the state of a flow, and `Tape` the record of its moves: the search writes it, `replay`
-follows it, and the package beyond `engine` reads it. Charts have functions of their own, which must
-not meet the states of another chart:
+follows it, and the package beyond `engine` reads it. Each chart has functions of its own, which
+must not be evaluated at the states of another chart:
 
-- `only` gives a chart its own states: values of other lanes are replaced.
+- `only` replaces the states of lanes in other charts.
 - `needed` stops derivatives where a chart has no lane.
-- `nan_where` marks what failed, in values and derivatives.
+- `nan_where` marks lanes that failed, in values and derivatives.
 
-NaN in a derivative whose values are right comes from these three. (`_core/lanes.py` brings
-functions of single states to lanes.)
+If values are right and derivatives are NaN, look in these three. (`_core/lanes.py` turns functions
+of single states into functions of lanes.)
 """
 
 from collections.abc import Callable
@@ -35,9 +36,9 @@ class Lanes(NamedTuple):
     chart: Index
     q: Padded
     armed: Bool[Array, "G L"]
-    """Which transitions (rows, by index) are waiting. Such a transition fires at the next zero
-    through which its guard falls, or at once if the guard is beyond zero. A scheduled one fires if
-    it is due at t."""
+    """Which transitions (rows, by index) are armed. An armed transition fires when its guard next
+    falls through zero, or at once if the guard is below zero. An armed scheduled transition fires
+    if it is due at t."""
     events: Index
     """Number of events so far."""
     pace: Float[Array, "4 L"]
@@ -46,8 +47,9 @@ class Lanes(NamedTuple):
 
 
 def start_lanes(s: Structure, t: Times, chart: Index, q: Padded) -> Lanes:
-    """Lanes before their first step. No guard is armed yet: the search does that."""
-    # (Zeros of the lanes: where `jax.vmap` maps these, JAX would trace loops over constants again.)
+    """Lanes before their first step. No guard is armed yet: the search arms them."""
+    # (A zero that depends on the lanes: with a constant, `jax.vmap` would trace loops a second
+    # time.)
     zero = chart * 0
     armed = np.zeros((len(s.transitions), t.shape[0]), bool)
     return Lanes(
@@ -98,10 +100,12 @@ def for_each_chart(s: Structure, chart: Index, mask: Mask, work: Callable, out):
 
 
 def only(mask: Mask, x: Array) -> Array:
-    """`x`, with the lanes outside `mask` replaced by one lane of it; itself if it is one for all.
+    """`x`, with each lane outside of `mask` replaced by a lane inside of it. An array with a single
+    entry for all lanes is returned as it is.
 
-    A chart's functions are thus never evaluated at another chart's states, where they might be
-    undefined; NaN there would poison reverse-mode derivatives even if it is masked afterwards.
+    Thus a chart's functions are never evaluated at states of another chart, where they might be
+    undefined. NaN at such states would reach reverse-mode derivatives even if the value is masked
+    afterwards.
     """
     if x.shape[-1] < mask.shape[0] or (on_host(mask) and mask.all()):
         return x
@@ -110,21 +114,22 @@ def only(mask: Mask, x: Array) -> Array:
 
 
 def fixed(tree):
-    """The same numbers without derivatives."""
+    """The tree with its values, but without derivatives (`stop_gradient`)."""
     arrays, static = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
-# Any number but zero becomes infinite if it is multiplied twice by this one. Smaller: small
+# Any number but zero becomes infinite if it is multiplied twice by this number. Smaller: small
 # derivatives of lanes that failed are kept. (It must be finite: zero times infinity is NaN.)
 _LARGE = 1e300
 
 
 def nan_where(failed: Mask, x: Float[Array, "*K n L"]) -> Float[Array, "*K n L"]:
-    """x, with NaN for the lanes that failed. Their derivatives are NaN, too, where they are used.
+    """x, with NaN for the lanes that failed, in values and in derivatives.
 
-    A lane whose result nobody uses has a derivative of zero in reverse mode. It stays zero: zero
-    times NaN would be NaN, and would reach the parameters, which all lanes share.
+    In reverse mode, a lane whose result is not used has a cotangent of zero, which stays zero here.
+    (Zero times NaN would be NaN, and would spoil the gradient by the parameters, which all lanes
+    share.)
     """
     if on_host(x):
         return np.where(failed, np.nan, x)
@@ -142,10 +147,11 @@ def _nan_where_jvp(primals, tangents):
     _, t_x = tangents
     large = jnp.where(failed, _LARGE, 1.0)
     none = jnp.where(failed, 0.0, 1.0)
-    # (Where a lane failed, the first two factors make a derivative infinite, and the zero makes it
-    # NaN. Reverse mode multiplies from the other end, and meets the last two first.)
+    # (Where a lane failed, the first two factors make a derivative infinite, and the zero then
+    # makes it NaN. Reverse mode multiplies in the opposite order, so that the last two factors come
+    # first.)
     spoiled = t_x * large * large * none * large * large
-    # (A number that does not change has NaN, too, where others of its lane do.)
+    # (A number whose own derivative is zero gets NaN, too, if another number of its lane has one.)
     others = jnp.sum(spoiled, axis=-2, keepdims=True)
     return _nan_where(failed, x), spoiled + jnp.where(failed, others, 0.0)
 
@@ -153,9 +159,9 @@ def _nan_where_jvp(primals, tangents):
 def needed(mask: Mask, tree):
     """`tree` itself, without derivatives if `mask` has no lanes.
 
-    Where `jax.vmap` maps a branch, both of its sides are computed, the one that is not taken with
-    zero cotangents. At another chart's states these may meet infinite derivatives, and zero times
-    infinity is NaN: it must not reach states or parameters.
+    Where `jax.vmap` maps a branch, JAX computes both sides. The side that is not taken has
+    cotangents of zero. At states of another chart its derivatives may be infinite, and zero times
+    infinity is NaN, which must not reach states or parameters.
     """
     if on_host(mask):
         return tree
@@ -184,14 +190,16 @@ def side_by_side(tree):
     return jax.tree_util.tree_map(move, tree)
 
 
-# Codes on a tape. Codes >= 0 are the transition that fires at the end of a move.
+# Codes on a tape: how a move ends. A code >= 0 is the index of the transition that fires at the
+# end.
 IDLE, MOVE, ARRIVE_TIME, ARRIVE_LEVEL = range(-4, 0)
 # More events than any flow has.
 MANY = np.iinfo(np.int32).max
 
 
 class Tape(NamedTuple):
-    """The moves, one row per iteration and one column per lane. Without its first axis: one row."""
+    """The moves of lanes: one row for each iteration of the search, one column for each lane. A
+    `Tape` whose arrays lack the first axis is a single row."""
 
     h: Float[Array, "R L"]
     """Length of the move."""
@@ -206,11 +214,11 @@ class Tape(NamedTuple):
     chart: Int[Array, "R L"]
     """Chart after the reset."""
     at_once: Bool[Array, "R L"]
-    """Whether the move is an event at once, whose guard was beyond zero: its time is that of the
-    event before."""
+    """Whether the move is an event at once: its guard was below zero right after the event before,
+    and it happens at the same time."""
     rival: Int[Array, "R L"]
-    """Another transition (by index; negative: none) whose armed guard is at zero, too, where the
-    move ends in an event: neighbors may meet it first."""
+    """Another transition (by index; negative: none) whose armed guard is also zero at the event
+    that ends the move. Neighboring trajectories may reach either event first."""
     events: Int[Array, "R L"]
     """Number of the lane's events so far; `MANY` in rows that have not been written."""
 
@@ -236,8 +244,8 @@ def blank_tape(rows: int, lanes: Lanes) -> Tape:
 
 
 def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:
-    """The tape of fewer `lanes`, each of which makes the moves of a group, one after the other.
-    Groups are numbered from 0, in order."""
+    """Join columns of a tape: all lanes with the same number in `group` become one lane, whose
+    moves follow each other. Groups are numbered from 0, in order."""
     lane, row = np.nonzero(tape.code.T != IDLE)
     group = group[lane]
     order = np.arange(len(group)) - np.searchsorted(group, group)
@@ -248,8 +256,8 @@ def regrouped(tape: Tape, group: Int[np.ndarray, " L"], lanes: Lanes) -> Tape:
 
 
 def stack_rows(parts: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Arrays of several tapes, the shorter ones with further rows without moves. (Of such rows only
-    the code is read.)"""
+    """Stack the arrays of several tapes. Shorter tapes get further rows without moves. (Only the
+    code of such rows is read.)"""
     rows = max(map(len, parts))
     blank = IDLE if parts[0].dtype.kind == "i" else 0
     shape = (len(parts), rows, *parts[0].shape[1:])

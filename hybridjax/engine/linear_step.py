@@ -1,9 +1,11 @@
 r"""The derivatives of a Runge-Kutta step, on the host.
 
-Stage i of an explicit method has the state $x_i = q + h \sum_{j<i} a_{ij} k_j$ and the rate
-$k_i = f(t + c_i h, x_i, u)$. Its derivatives by t, q, u and h follow stage by stage from those of
-the field, which other kernels need, too, so that no program is compiled for them. Implicit methods
-have a kernel, by forward mode.
+`replay.py` calls `linear_step` for many recorded steps at once, and multiplies the results. Stage i
+of an explicit method has the state $x_i = q + h \sum_{j<i} a_{ij} k_j$ and the rate $k_i = f(t +
+c_i h, x_i, u)$. The derivatives of the stages by t, q, u and h follow from the derivatives of the
+field, one stage after the other (`_explicit`). The compiled derivative of the field exists already,
+so that nothing more is compiled. A step of an implicit method is differentiated by JAX, in a
+compiled function of its own (`kernels.linear_step`).
 """
 
 import numpy as np

@@ -1,13 +1,14 @@
-"""Flow of many trajectories (lanes) to their targets, with derivatives: search and replay as one.
+"""Flow of many trajectories (lanes) to their targets, with derivatives.
 
 `move` is the function that other code calls. Its values are those of a search (`search/`), which
-decides on steps and events. Its derivatives, in forward and reverse mode, are those of a `replay`
-of the tape that the search has recorded; `_move_jvp` is the rule that joins both. With arrays of
-NumPy, `move` calls the search on the host, without derivatives; with those of JAX, it is traced.
+decides on steps and events and records them on a tape. Its derivatives, in forward and reverse
+mode, are those of a `replay` of this tape (the same steps again, without decisions). `_move_jvp` is
+the rule that joins both. With arrays of NumPy, `move` calls the search on the host, without
+derivatives; with those of JAX, it is traced.
 
 - `through` flows a lane to one target after the other, such as the ends of the pieces of a turn.
 - `follow` gives the derivatives of `move` to a flow that was recorded before.
-- `flow_jacobian` and `tape_jacobian` compute whole Jacobians, all columns in one pass.
+- `flow_jacobian` and `tape_jacobian` compute Jacobians, all columns at once.
 
 Nothing is decided here: look for wrong values in the search, and for wrong derivatives in
 `replay.py`, which says how single moves are tested. What this file can get wrong is which numbers
@@ -53,9 +54,9 @@ def move(
 ) -> Recorded:
     """Flow every lane to its target under a constant input.
 
-    Lanes fail one by one, with a code each; nothing is raised. Times and states have exact
-    derivatives (first and second, through crossings too) with respect to everything that is a
-    floating-point array: states, times, inputs, parameters, the target. The tape has none.
+    Nothing is raised: a lane that fails has a `Result` code. Times and states have exact first and
+    second derivatives, through crossings, too, with respect to all floating-point arrays: states,
+    times, inputs, parameters, the target. The tape has no derivatives.
 
     `setout` is the first step, or a `Stride`.
     """
@@ -72,7 +73,7 @@ def move(
 
 
 def stride(h: Times) -> Stride:
-    """A first step of this length, on a way that is not known."""
+    """A `Stride` with this first step, without other knowledge of the way."""
     return Stride(h, h * 0, h * 0 + 1)
 
 
@@ -85,13 +86,14 @@ def through(
     options: Options,
     patience: float = np.inf,
 ) -> tuple[tuple[Lanes, Stride, Index], tuple[Lanes, Moved, Tape | None]]:
-    """Flow a single lane, or lanes with systems of their own, to one of the `targets` after the
-    other, waiting for each no longer than `patience`. On the host these are many calls of small
-    programs, or a single one, if `options.at_once`.
+    """Flow a single lane, or lanes with a system each, to the `targets` one after the other. A flow
+    to one target lasts no longer than `patience`. On the host this takes many calls of small
+    programs, or one call of a large program if `options.at_once`.
 
     **Arguments:** `begin`: the lanes, their strides and their results.
 
-    **Returns:** the same at the end; by target (rows) the lanes before, their ends, and the tape.
+    **Returns:** the lanes, strides and results at the last target; for each target (rows) the lanes
+    before, the lanes at the target, and the tape.
     """
     ends = (targets.time, targets.index, targets.event, targets.limit)
     levels = targets.levels
@@ -135,7 +137,8 @@ def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
 def searched(
     s, lanes, u, target, setout, result, settings, options: Options
 ) -> Recorded:
-    """The search as a program, with the axes that `jax.vmap` maps as more lanes. No derivatives."""
+    """The search as a program, without derivatives. Axes that `jax.vmap` maps become further
+    lanes."""
 
     def run(s, target, common, by_lane):
         settings, options = common
@@ -148,7 +151,7 @@ def searched(
 def _over_lanes(
     run: Callable, s: Structure, target: Target, common: tuple, by_lane: tuple
 ) -> Any:
-    """`run(s, target, common, by_lane)`, with the axes that `jax.vmap` maps as more lanes."""
+    """Call `run(s, target, common, by_lane)`. Axes that `jax.vmap` maps become further lanes."""
 
     def whole(common, by_lane):
         source, levels, *common = common
@@ -177,7 +180,8 @@ def _move_jvp(primals, tangents):
 
 @eqx.filter_custom_jvp
 def follow(s, lanes, u, target, recorded: Recorded) -> Recorded:
-    """Recorded flow, with the derivatives of `move` from lanes that are close to its start."""
+    """The values of a recorded flow, with the derivatives of `move` at `lanes`, which must be close
+    to the start of the record."""
     return recorded
 
 
@@ -217,12 +221,12 @@ def flow_jacobian(
     h: Times,
     result: Index,
 ) -> tuple[Jacobians, Moved, Tape]:
-    """Derivative of (t, q) at the targets with respect to q at the start, without input that may
-    have jumped, in JAX.
+    """Derivative of (t, q) at the targets with respect to q at the start, in JAX. The input does
+    not jump at the start.
 
-    Exact, through every event on the way, and differentiable once more. Each column is one
-    forward-mode tangent; all columns and lanes are pushed forward in one pass. (Linearizing first
-    and mapping afterwards would store every stage, and takes 20 times as long.)
+    The derivative is exact, through every event on the way, and can be differentiated once more.
+    Each column is one forward-mode tangent; all columns and lanes are pushed forward in one pass.
+    (Linearizing first and mapping afterwards would store every stage, and takes 20 times as long.)
 
     **Returns:** the Jacobians, the lanes at their targets, and the record of the flow.
     """
@@ -245,8 +249,11 @@ def tape_jacobian(
     across: Float[Array, "A d"] | None = None,
 ) -> tuple[Jacobians, Float[Array, "n L"]]:
     """Derivative of (t, q) at the targets of a recorded flow with respect to (t, q, u) at the
-    start, at u = 0, or to q only (`of_states`), and (t, q) at the targets. `across`: see `chain`;
-    traced, it makes no difference."""
+    start, at u = 0; and (t, q) at the targets.
+
+    **Arguments:** `of_states`: take derivatives by q only. `across`: see `chain`; it has no effect
+    inside of programs of JAX.
+    """
     if on_host(lanes.t):
         return chain(s, lanes, target, tape, of_states, across)
     columns, end = _push(s, lanes, target, tape, of_states)
@@ -280,7 +287,7 @@ def _columns(s, lanes, target, tape, of_states):
 
 @eqx.filter_custom_jvp
 def _push(s, lanes, target, tape, of_states):
-    """`_columns`, with the axes that `jax.vmap` maps as more lanes."""
+    """Call `_columns`. Axes that `jax.vmap` maps become further lanes."""
 
     def run(s, target, common, by_lane):
         return _columns(s, by_lane[0], target, by_lane[1], of_states)

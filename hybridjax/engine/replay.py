@@ -1,17 +1,18 @@
-"""Derivatives of recorded flow: the moves on a tape, integrated again.
+"""Derivatives of recorded flow: the moves on a tape (see `lanes.py`) are integrated again.
 
 The decisions of a search (step sizes, the order of events) are fixed here; only smooth arithmetic
 is left. The times of crossings follow from two Newton steps on the true guard (`ChartFlow.locate`),
-which carry the derivatives that `saltation.py` writes out.
+whose derivatives are those of the formula in `saltation.py`.
 
 - `replay` is a function of JAX's arrays with exact derivatives in forward and reverse mode.
-- `chain` multiplies the Jacobians of the moves on the host: of the Runge-Kutta step, of the
-  crossing at its end, and of the reset. Every move is linearized at its recorded start, so that all
-  moves in a chart are done in one pass.
-- `Variation` moves the start of a record, the numbers of the system and the times of the targets in
-  some directions, on the host, and gives the tangents of states and of the Jacobians of `chain`.
-- `recorded_moves` reads the moves of a tape, and `linear_moves` linearizes each: what all who work
-  with recorded flow on the host begin with.
+- `chain` multiplies the Jacobians of the moves on the host. A move has three of them: of the
+  Runge-Kutta step, of the crossing at its end, and of the reset. Since every move starts at its
+  recorded state, all moves in a chart are linearized by one call.
+- `Variation` computes directional derivatives on the host, where the start of a record, the
+  parameters of the system and the times of the targets change. It returns derivatives of the
+  states, and of the Jacobians of `chain`.
+- `recorded_moves` reads the moves of a tape, and `linear_moves` linearizes each. All code that
+  works with recorded flow on the host begins with these two.
 
 A wrong derivative has its cause in a single move: compare `linear_moves` with differences of the
 three stages `_after_steps`, `_at_zeros` and `_after_resets`. If single moves are right, the order
@@ -53,8 +54,9 @@ from .target import Target
 from .watch import ChartFlow, slopes
 
 
-# Rows of a tape that are skipped, or computed again by reverse mode, together. Higher: empty rows
-# are computed. Lower: reverse mode stores more states.
+# Number of rows of a tape in a block. Blocks are skipped as a whole if they are empty, and reverse
+# mode stores one state for each block. Higher: empty rows are computed. Lower: reverse mode stores
+# more states.
 _BLOCK = 16
 
 
@@ -90,7 +92,8 @@ def replayed_ways(
 def _replayed(
     s: Structure, lanes: Lanes, u: Inputs, target: Target, tape: Tape, keeps: bool
 ) -> tuple[tuple[Times, Padded], Any]:
-    """The end of a recorded piece of flow, and if it `keeps` them, the ends of all moves."""
+    """Time and state at the end of a recorded piece of flow; with `keeps`, also those at the ends
+    of all moves."""
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
     scheduled = jnp.array([*is_scheduled, False])
     level = len(s.transitions)
@@ -136,8 +139,8 @@ def _replayed(
         _, code, _ = rows
         return jax.lax.cond(some(code != IDLE), follow, stay, carry)
 
-    # Most tapes are empty but for their beginning: empty blocks of rows are skipped, and reverse
-    # mode keeps no more of a block than where it starts.
+    # Most tapes have moves in their first rows only. Empty blocks of rows are skipped, and reverse
+    # mode stores only the state at the start of each block.
     rows, L = tape.h.shape
     fill = ((0, -rows % _BLOCK), (0, 0))
     padded = jnp.pad(tape.h, fill)
@@ -162,7 +165,8 @@ def _advance(
     h: Times,
     which: Index,
 ) -> tuple[Times, Padded]:
-    """A step of every lane that moves, ended on the zero of its crossing function, if any."""
+    """One step of every lane that moves. If the move ends in a crossing, the step is corrected to
+    the zero of that function."""
     t = lanes.t
     q = lanes.q
     chart = lanes.chart
@@ -176,11 +180,11 @@ def _advance(
         t0, q0, u0, h0 = needed(here, start)
         flow = ChartFlow(system, a, u0, *goal)
         still = ChartFlow(fixed(system), a, fixed(u0), *goal)
-        # (The charts, which may hold traced values, are made here, and not within a branch.)
+        # (The method is read outside of the branch: making the charts may create traced values.)
         method = flow.method
         crossing = jnp.where(here, which, -1)
 
-        # (A branch of its own, lest XLA masks the states again in every stage.)
+        # (In a branch: otherwise XLA would mask the states again in every stage.)
         def step():
             end = take_step(method, flow.field, t0, q0, h0, still.field)
             return end.q, end.f1
@@ -203,7 +207,7 @@ def _advance(
 
 
 class Moves(NamedTuple):
-    """Moves of any lanes, on the last axis."""
+    """Moves of lanes, one after the other on the last axis."""
 
     t: Float[np.ndarray, " M"]
     chart: Int[np.ndarray, " M"]
@@ -212,7 +216,7 @@ class Moves(NamedTuple):
     code: Int[np.ndarray, " M"]
     lane: Int[np.ndarray, " M"]
     order: Int[np.ndarray, " M"]
-    """Number of moves of the same lane before this one."""
+    """Number of earlier moves of the same lane."""
     at_once: Bool[np.ndarray, " M"]
     """See `Tape`."""
 
@@ -226,11 +230,12 @@ def chain(
     across: Float[np.ndarray, "A d"] | None = None,
 ) -> tuple[Float[np.ndarray, "L n m"], Float[np.ndarray, "n L"]]:
     """Derivatives of (t, q) at the end of a record by (t, q, u) at its start, at u = 0, or by q
-    only; and (t, q) at the end.
+    only. Also returns (t, q) at the end.
 
-    `across` holds sizes of states by chart, for autonomous systems and targets at which the
-    direction of the flow has no meaning. This direction is projected out of every move, so that it
-    does not drown the others, however strongly the flow contracts.
+    **Arguments:** `across`: magnitudes of states by chart, for autonomous systems and targets at
+    which a deviation along the flow has no meaning. Deviations along the flow are then projected
+    out of every move. Otherwise they would drown all other deviations where the flow contracts
+    strongly.
     """
     n = 1 + s.d
     moves = recorded_moves(lanes, tape)
@@ -265,10 +270,12 @@ def _products(moves: "Moves", by: Float[np.ndarray, "M n m"], L: int) -> np.ndar
 
 
 class Variation:
-    """Recorded lanes that follow each other, each beginning where the last one ended, and their
-    derivatives in P directions: those of `s`, and of the `times` (P, L) of their targets.
+    """Derivatives of recorded flow in P directions.
 
-    **Arguments:** `twice`: whether `jacobians` will be asked for, which takes second derivatives of
+    The lanes follow each other: each begins where the last one ended. A direction is a change of
+    the parameters in `s` and of the `times` (P, L) of the targets.
+
+    **Arguments:** `twice`: whether `jacobians` will be called, which needs second derivatives of
     every move.
     """
 
@@ -290,7 +297,7 @@ class Variation:
         if len(self.first) < len(lanes.t):
             raise NotOnHostError
 
-        # Every move in all directions: of its start, and the P ones.
+        # Every move is varied in all directions of its start, and in the P given ones.
         def many(x):
             return np.repeat(x, n + P, axis=-1)
 
@@ -345,8 +352,9 @@ class Variation:
     def jacobians(
         self, tangents: Float[np.ndarray, "moves n P"], sizes: Any = None
     ) -> Any:
-        """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, and
-        their own in each direction, as complex numbers. `sizes`: as `across` of `chain`."""
+        """Derivatives (L, P, n, m) of (t, q) at the ends of lanes by (t, q, u) at their starts, as
+        complex numbers: the imaginary part is the derivative in each direction (see
+        `kernels.Tangents`). `sizes`: as `across` in `chain`."""
         moves = self._moves
         M, n, m = self._by.shape
         P = tangents.shape[2]
@@ -394,7 +402,8 @@ class Variation:
 def _until_ticks(
     s: kernels.Tangents, moves: Moves, t: np.ndarray, q: np.ndarray, lane: np.ndarray
 ) -> np.ndarray:
-    """Lengths of moves, which end at the ticks of clocks where these move."""
+    """Lengths of moves. A move that ends at the tick of a clock changes with the time of the
+    tick."""
     h = moves.h + 0j
     for g, transition in enumerate(s.transitions):
         at = moves.code == g
@@ -410,7 +419,8 @@ def _until_ticks(
 def linear_moves(
     s: Structure, moves: Moves, target: Target
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(t, q) after some moves (M, n), and its derivatives by (t, q, u) before them (M, n, m)."""
+    """(t, q) after some moves, (M, n); and the derivatives of these by (t, q, u) before the moves,
+    (M, n, m)."""
     n = 1 + s.d
     M = len(moves.t)
     number = target.time.dtype
@@ -498,7 +508,8 @@ def _after_steps(s: Structure, a: int, moves: Moves, target: Target, u) -> _Ends
     field = expanded[:, :, 1].T
     by_start = expanded[:, :, 2:-1]
     by_length = expanded[:, :, -1:]
-    # A step to a known time shrinks with t, and lasts until a schedule has come.
+    # The length of a step to a known time shrinks as t grows; a step to a scheduled event ends at
+    # its schedule.
     shape = (len(t), 1, by_start.shape[2])
     longer = np.zeros(shape, by_start.dtype)
     longer[:, 0, 0] = -1.0 * (by_clock | on_time)
@@ -560,14 +571,14 @@ def _at_zeros(
     field = expanded[:, :, :1]
     by_field = by_point(expanded, n)
 
-    # Each move has its own function that is zero.
+    # Each move ends at the zero of its own watched function.
     watched = kernels.watched(landing, a, target.levels, *at, index=index)
     is_crossed = np.array(flow.rows)[:, None] == crossed
     row = np.argmax(is_crossed, axis=0)
     own = watched[row, :, np.arange(len(lands))]
     watched = own[:, None]
 
-    # (Over the time past: nothing but rounding errors, with derivatives.)
+    # (The time `past` is a rounding error, but it has derivatives.)
     past = zero.past[:, None, None]
     before = ends.dq[lands]
     dt = ends.dt[lands]

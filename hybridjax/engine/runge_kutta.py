@@ -1,8 +1,12 @@
 """Steps of Runge-Kutta methods, explicit and implicit, for many lanes of one chart at once.
 
-Lanes stand on the last axis: `t`, `h` are (L,), `q` is (n, L); both t and h may be the same for all
-lanes, as arrays of one. A field is a function (t, q) -> (n, L) of whole arrays: one array per stage
-lets XLA compute each stage once. The default method of a chart is in `systems/verner.py`.
+`take_step` is the entry: it is called by `watch.ChartFlow.step` in the search and the replay, and
+by `kernels.py`. Lanes (trajectories side by side) stand on the last axis: `t` and `h` are (L,), or
+(1,) if they are the same for all lanes, and `q` is (n, L). A field is a function (t, q) -> (n, L)
+of all lanes at once: as one array for each stage, XLA computes every stage once. The default method
+of a chart is in `systems/verner.py`. Of a wrong step, compare `_looped_stages` with
+`_unrolled_stages` (explicit), or see `increments` (implicit); a step that is too long has its cause
+in `errors`.
 """
 
 import functools as ft
@@ -23,8 +27,8 @@ from .halfway import halfway
 
 LaneField = Callable[[Array, Array], Array]
 
-# Stages are always unrolled from this number of lanes on. Higher: large batches run up to twice as
-# long. Lower: small batches compile for twice as long.
+# Number of lanes from which on stages are unrolled. Higher: large batches run up to twice as long.
+# Lower: small batches compile for twice as long.
 _UNROLLED_LANES = 128
 
 
@@ -38,9 +42,10 @@ class Step(NamedTuple):
     f1: States
     """Field at the end."""
     estimate: States
-    """Embedded estimate: the error is a power of it, relative to the size of what changes."""
+    """Embedded estimate of lower order. The error of the step is a power of it, relative to the
+    magnitude of the state's change."""
     error: States
-    """Estimate of the error, however little is excited."""
+    """Estimate of the error that is also right if fast modes are hardly excited."""
     middle: States
     """State halfway, of lower order."""
     rate: States
@@ -57,8 +62,11 @@ def take_step(
 ) -> Step:
     """One step of a method from (t, q) over h.
 
-    For many lanes, the stages of an explicit method are unrolled: faster, and slower to compile.
-    For derivatives of an implicit step give `still`, the field without any.
+    For many lanes, the stages of an explicit method are unrolled, which runs faster and compiles
+    more slowly.
+
+    **Arguments:** `still`: the field without derivatives, for an implicit step that is
+    differentiated.
     """
     if method.implicit:
         return _implicit_step(method, field, t, q, h, still)
@@ -109,7 +117,8 @@ def looped_step(
         return jnp.sum(w[:, None, None] * K, axis=0)
 
     def stage(k, K):
-        # (States and rates apart: XLA would compute one of them again in each row of the other.)
+        # (`apart` keeps state and rate from being fused: XLA would compute one again for each row
+        # of the other.)
         y = apart(q + h * weighted(a[k], K))
         time = t + c[k] * h
         rate = apart(field(time, y))
@@ -131,8 +140,8 @@ def _unrolled_stages(method, field, t, q, h) -> list[States]:
 
 
 def _combine(weights, K):
-    """Sum of weights times the first stages. Unrolled, it is compiled into one loop with the
-    stage."""
+    """Sum of weights times the first stages, unrolled, so that XLA compiles it into one loop with
+    the next stage."""
     total = 0.0
     for weight, stage in zip(weights, K, strict=False):
         if weight != 0:
@@ -141,15 +150,15 @@ def _combine(weights, K):
 
 
 def _contract(weights, K):
-    """Sum of weights times stages, which are rows of one array."""
+    """Sum of weights times stages, where the stages are rows of one array."""
     return jnp.tensordot(np.array(weights), K, 1)
 
 
 def rounding_error(field: LaneField, t: AnyTimes, q: States, f: States) -> States:
     """The largest change of the field under rounding errors of time and states, where f is the
     field at (t, q); zero where it is not finite."""
-    # Shifts of both signs, odd and even; not all states by the same part, since a common factor may
-    # cancel.
+    # Shifts of both signs, odd and even ones. Each state has another shift, since a common factor
+    # might cancel.
     shifts = [np.roll([-3.1, 1.9, -0.8, 4.4], k) for k in range(len(q) + 1)]
     shifts = np.stack(shifts, axis=1)
     xp = namespace(q)
@@ -174,9 +183,9 @@ def short_step(
 
     Its derivatives at h = 0 are right to order 4.
 
-    **Returns:** the state at t + h, and its distance from methods of order 2, of order h^3. (That
-    from the midpoint rule vanishes where h is four times the decay time of a mode, that from the
-    other nowhere.)
+    **Returns:** the state at t + h, and the larger of its distances from two methods of order 2,
+    which are of order h^3. (The distance from the midpoint rule vanishes if h is four times the
+    decay time of a mode, the distance from the other method never.)
     """
     xp = namespace(q)
     half = 0.5 * h
@@ -232,9 +241,9 @@ def _implicit_step(
 ) -> Step:
     """One step of an implicit method. The last change of Newton's iterations counts as an error.
 
-    With `still`, the stages are corrected twice by Newton's method with the true Jacobian at their
-    solution: that changes them by rounding errors only, but carries their first and second
-    derivatives, by the implicit function theorem.
+    With `still`, two Newton corrections with the true Jacobian follow at the solution of the
+    stages. They change the stages by rounding errors only, but give them their first and second
+    derivatives (implicit function theorem).
     """
     start = [jax.lax.stop_gradient(x) for x in (t, q, h)]
     w, left, J = increments(method, still or field, *start)
@@ -272,10 +281,11 @@ def step_along(
 def errors(
     method: Method, w: Float[Array, "s n L"], left: States, J, h: AnyTimes
 ) -> tuple[States, States]:
-    """The embedded estimate of a step, and that of its error, however little is excited.
+    """The embedded estimate of a step, and an estimate of its error that is also right if fast
+    modes are hardly excited.
 
-    **Arguments:** `w`: increments of the stages, which are right but for `left`. `J`: the Jacobian
-    of the field at the start.
+    **Arguments:** `w`: increments of the stages, with the error `left`. `J`: the Jacobian of the
+    field at the start.
     """
     plain = _contract(method.error, w)
     coefficients = method.rough or np.zeros(len(method.b))
@@ -285,9 +295,10 @@ def errors(
         shift = _shifted(J, method.filter * h)
         estimate = _apply(inverse(shift), plain)
 
-    # The method has a higher order than the estimate where it is smooth: the ratio of two estimates
-    # takes the place of the step. It has not where a fast mode was excited, by however little, and
-    # dies out in the step (the ratio is 1), nor where one follows (the filter tells).
+    # Where the solution is smooth, the method has a higher order than the estimate: the estimate is
+    # multiplied by the ratio of two estimates, which is small there. The ratio is 1 where a fast
+    # mode was excited and dies out within the step, and the filtered estimate is large where a fast
+    # mode follows the solution: in both cases the error is as large as the estimate.
     def divide(x):
         size = jnp.where(x == 0, 1.0, jnp.abs(x))
         return jnp.abs(estimate) / size
@@ -321,7 +332,7 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
         residual = h * rate - w
         solved = []
         for i, r in enumerate(_contract(right, residual)):
-            # (R is lower triangular: row i needs the rows before, which are solved.)
+            # (R is lower triangular: row i needs the solutions of the rows before.)
             known = [g * x for g, x in zip(R[i], solved, strict=False) if g != 0]
             if known:
                 r = r + h * _apply(J, sum(known, start=0.0))
@@ -336,7 +347,7 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
         now = jnp.max(jnp.abs(change), axis=0)
         largest_increment = jnp.max(jnp.abs(w), axis=0)
         size = jnp.abs(q) + largest_increment
-        # A component goes on while it moves by more than rounding errors, and converges.
+        # A component is iterated while it changes by more than rounding errors, and converges.
         moves = now > small * size
         converges = (now < 0.5 * last) | (i < 2)
         going = (moves & converges).any()
@@ -379,16 +390,16 @@ class StageEquations(NamedTuple):
     """
 
     inverses: tuple[Float[Array, "n n L"], ...]
-    """Of the blocks on the diagonal, once those before are eliminated."""
+    """Inverses of the diagonal blocks, after elimination of the blocks before."""
     lower: dict[tuple[int, int], Float[Array, "n n L"]]
-    """Multiples of earlier rows of blocks that are taken from later ones."""
+    """Factors with which earlier rows of blocks are subtracted from later rows."""
     upper: dict[tuple[int, int], Float[Array, "n n L"]]
 
     @classmethod
     def at(
         cls, method: Method, field: LaneField, t, q, h, w: Float[Array, "s n L"]
     ) -> "StageEquations":
-        """Those at increments w of a step from (t, q) over h."""
+        """The equations at the increments w of a step from (t, q) over h."""
         A = np.array(method.a)
         c = np.array(method.c)[:, None]
         times = t + c * h
@@ -408,7 +419,7 @@ class StageEquations(NamedTuple):
     def factored(
         cls, blocks: dict[tuple[int, int], Array], stages: int
     ) -> "StageEquations":
-        """Those with these blocks by Gaussian elimination; blocks that are left out are zero."""
+        """Factor a matrix with these blocks, by Gaussian elimination. Missing blocks are zero."""
         rest = dict(blocks)
         inverses = []
         lower: dict[tuple[int, int], Array] = {}

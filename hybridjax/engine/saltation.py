@@ -7,11 +7,13 @@ field $f^-$ before the event. After it, at the same fixed time, the deviation is
 $$x^+ = R_q x + (R_q f^- + R_t - f^+)\,\delta$$
 
 with the reset $R$ and the field $f^+$ after it (M. A. Aizerman and F. R. Gantmacher, Quarterly J.
-Mechanics and Applied Mathematics 11, 1958). Of a scheduled event, $h$ is the time that is left:
-its delay depends on inputs only.
+Mechanics and Applied Mathematics 11, 1958). For a scheduled event, $h$ is the time that is left
+until the event, which does not depend on the state.
 
-`replay.py` calls `delay_of_zero` and `chained` for deviations of both time and state. For columns
-that programs carry along an itinerary, `itinerary/bodies.py` has the formula by forward mode.
+`jump` evaluates the formula at many points at once, for `orbits/` (linear flow, verdict,
+coincidence). `replay.py` calls `delay_of_zero` and `chained`, for deviations of both time and
+state. In compiled programs that follow an itinerary, `itinerary/bodies.py` gets the same formula by
+forward mode.
 """
 
 from typing import NamedTuple
@@ -45,8 +47,8 @@ def chained(
     dt: Inexact[np.ndarray, "P 1 m"],
     dq: Inexact[np.ndarray, "P n m"],
 ) -> Inexact[np.ndarray, "P k m"]:
-    """Derivatives of a function of (t, q, u) by those of t and q with respect to m numbers, the
-    last of which are the inputs u."""
+    """Derivatives of a function of (t, q, u) by m numbers, from the derivatives `dt` and `dq` of t
+    and q by these numbers (chain rule). The last of the m numbers are the inputs u."""
     out = by.by_t @ dt + by.by_q @ dq
     inputs = by.by_u.shape[2]
     out[:, :, out.shape[2] - inputs :] += by.by_u
@@ -59,8 +61,8 @@ def delay_of_zero(
     dt: Inexact[np.ndarray, "P 1 m"],
     dq: Inexact[np.ndarray, "P n m"],
 ) -> Inexact[np.ndarray, "P 1 m"]:
-    """Derivatives of the time at which a function of (t, q, u) is zero along the field, where the
-    points before have these derivatives; NaN where its rate is zero."""
+    """Derivatives of the time at which a function of (t, q, u) is zero along the field, from the
+    derivatives `dt` and `dq` of the points; NaN where the rate of the function is zero."""
     rate = by.by_t + by.by_q @ field
     change = chained(by, dt, dq)
     never = np.full_like(change, np.nan)
@@ -73,9 +75,9 @@ class Jump(NamedTuple):
     level: Inexact[np.ndarray, " P"]
     """The guard, or the time that is left."""
     rate: Inexact[np.ndarray, " P"]
-    """Its rate along the field."""
+    """Rate of the level along the field."""
     gradient: Inexact[np.ndarray, "P n"]
-    """Its derivative by the state."""
+    """Derivative of the level by the state."""
     after: Inexact[np.ndarray, "P m"]
     """State after the event."""
     by_state: Inexact[np.ndarray, "P m n"]
@@ -96,7 +98,7 @@ class Jump(NamedTuple):
 
     @property
     def input_saltation(self) -> Inexact[np.ndarray, "P m nu"]:
-        """The same by the inputs."""
+        """Derivative of the state after the event by the inputs, at a fixed time."""
         by_delay = self.slip[..., None] * self.delay_by_input[:, None]
         return self.by_input + by_delay
 

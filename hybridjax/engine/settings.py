@@ -1,4 +1,9 @@
-"""Accuracy and effort of the flow, and every accuracy that the package takes by default."""
+"""Accuracy and effort of the flow, and every default accuracy of the package.
+
+`Settings` is the public class that users give to `simulate` and `find_limit_cycle`; `filled` puts a
+default accuracy in. In each step, `search/attempt.py` asks `tolerance` for the error that the step
+may have, in units of the states' magnitudes (`size`).
+"""
 
 import functools as ft
 from collections.abc import Mapping
@@ -21,8 +26,8 @@ from .arrays import AnyTimes, Array, States
 from .runge_kutta import Step
 
 
-# Default accuracies: the error that one step may have, relative to the size of each state. A tenth
-# of the accuracy costs about 1.4 times as many steps (the method has order 7).
+# Default accuracies: the error that one step may have, relative to the magnitude of each state.
+# With a ten times smaller error, there are about 1.4 times as many steps (the method has order 7).
 SIMULATION = 1e-10
 """Single trajectories (`simulate`)."""
 LIMIT_CYCLE = 1e-12
@@ -30,7 +35,8 @@ LIMIT_CYCLE = 1e-12
 SWEEP = 1e-9
 """Many limit cycles at once (`find_limit_cycles`)."""
 TRANSIENT = 1e-6
-"""Flows that leave no trace in results: to the section, and the first turns of Newton's method."""
+"""Flows that have no effect on results: the flow to the section, and the first iterations of
+Newton's method."""
 
 # Accuracies of data: the error at every section, accumulated since the start of an experiment,
 # relative to the size of each state on the limit cycle.
@@ -129,11 +135,11 @@ def _kept(x: Any) -> Any:
 
 
 def size(settings: Settings, a: int, *q: States) -> States:
-    """Sizes of states of chart a against which errors are judged: those of `q` or, where `q` is
-    small, the usual ones.
+    """Magnitudes of states of chart a, relative to which errors are judged: the largest modulus
+    among `q`, plus `atol / rtol` times the magnitude in `settings.scale`.
 
-    If these are not known, a state that is zero is as large as the largest one, and a chart at rest
-    at zero has states of size 1.
+    If `settings.scale` is None, a state that is zero gets the magnitude of the largest state. If
+    all states are zero, they get 1.
     """
     xp = namespace(q[0])
     largest = ft.reduce(xp.maximum, map(xp.abs, q))
@@ -152,9 +158,9 @@ def tolerance(
 ) -> States:
     """The error that a step over tau from states `q` of chart a may have.
 
-    Where the usual sizes are not known, a state is taken to be as large as it is at the ends of the
-    step, or as it would become at the rates at its start if that is more. Rounding errors are
-    allowed: its own, and the `rounding` errors of its rate.
+    If `settings.scale` is None, the magnitude of a state is the largest of three: at both ends of
+    the step, and where its rate at the start would lead. Rounding errors are added: of the state,
+    and the `rounding` errors of its rate.
     """
     if settings.scale is not None:
         return settings.rtol * size(settings, a, q, step.q)

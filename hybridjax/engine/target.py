@@ -1,4 +1,9 @@
-"""Where a piece of flow ends: at a time, at the zero of a level function, or at an event."""
+"""Where a piece of flow ends: at a time, at the zero of a level function, or at an event.
+
+Callers of `move` make a `Target` (mostly by `toward` or `until`), with one entry for each lane (a
+trajectory of many side by side). The search reads it. `AbstractLevels` is the interface of sections
+whose position depends on the state; `sections/` and `orbits/crossing.py` implement it.
+"""
 
 import abc
 import dataclasses
@@ -37,8 +42,8 @@ class AbstractLevels(Definition):
 
 
 class Target(eqx.Module):
-    """The ends of a piece of flow, one per lane. Section and event may be the same for all, as
-    arrays of one."""
+    """The ends of a piece of flow, one per lane. Section and event may be arrays with a single
+    entry, which then holds for all lanes."""
 
     time: Float[Array, " L"]
     """End at this time; infinity if the end is not at a known time."""
@@ -58,7 +63,8 @@ class Target(eqx.Module):
     """End right after so many events; None for no such end."""
 
     def split(self) -> tuple["Target", AbstractLevels | PerLane | None]:
-        """The part that belongs to lanes, and the level functions, which all of them share."""
+        """Split into the fields with one entry for each lane, and the level functions, which all
+        lanes share."""
         return dataclasses.replace(self, levels=None), self.levels
 
     def with_levels(self, levels: AbstractLevels | PerLane | None) -> "Target":

@@ -1,4 +1,11 @@
-"""Fields that jump, or have pulses so short that the steps of an integration pass over them."""
+"""Find fields that jump, and pulses that are so short that integration steps pass over them.
+
+Three callers ask: `trajectory.py` tests each step of a simulation (`passed_over`),
+`orbits/checks.py` looks for jumps along a cycle (`jumps`), and searches ask whether pulses are
+possible at all (`may_have_pulses`, from the operations in the program of the field). A step passes
+over a pulse if the polynomial through eight values of a rate misses a part of its integral over the
+step (`_passing`). A *gain* is a derivative of the field by an input.
+"""
 
 import functools as ft
 from collections.abc import Callable, Iterator
@@ -20,34 +27,39 @@ from .cubic import interpolate
 from .settings import ROUNDING, Settings
 
 
-# Words of `jax_compat.suddenness`. Beside poles values fall as the inverse, or its square, of the
-# distance, which few points in a step see, unless the program has powers beyond squares.
+# A word of `jax_compat.suddenness`. Near a pole, a function decays as the inverse of the distance
+# or its square, so slowly that a few points in a step notice it, unless the program has higher
+# powers.
 POLES = frozenset(["pole"])
-# Pieces of a step, each with four points, and four times as many on cycles, but few if there may be
-# poles only. Fewer: short pulses are missed. More: time.
+# Number of intervals into which a step is divided, with four points in each. On cycles there are
+# four times as many; if only poles are possible, there are few. Fewer: short pulses are missed.
+# More: time.
 _PIECES = 64
 _FEW = 8
-# In a step, the integrals of a rate and of a polynomial through eight of its values may differ by
-# so many times the accuracy, and those of a gain, whose kinks no step meets, by this part of the
-# integral over all steps. Smaller: kinks are refused. Larger: pulses with this effect are missed.
+# The integrals over a step of a rate and of the polynomial through eight of its values may differ
+# by `_SAME` times the accuracy. For a gain, they may differ by the part `_SAME_GAIN` of the
+# integral over all steps, since steps do not end at kinks of gains. Smaller: kinks are refused.
+# Larger: pulses with this effect are missed.
 _SAME = 1e3
 _SAME_GAIN = 1e-5
-# A guard falls below zero by this part of its largest value. Smaller: one that comes near to zero
-# is taken to fall. Larger: such falls between steps are missed.
+# A guard falls below zero if it is negative by more than this part of its largest value. Smaller: a
+# guard that only comes near zero counts as falling. Larger: small falls between steps are missed.
 _NEAR = 1e-5
-# Points of a call, and steps whose points are kept at once. Fewer: more calls. More: few points
-# take longer, and many more memory.
+# Number of points in one call, and number of steps whose points are in memory at once. Fewer: more
+# calls. More: few points take longer, and many points take more memory.
 _POINTS = 1024
 # Operations with jumps or kinks.
 _KINKS = frozenset(["decision", "kink"])
-# A field jumps if it changes by this part of itself between points that are so many times closer,
-# in parts of the period and sizes of the states. Smaller changes: rounding is refused. Larger:
-# errors of multipliers are as large. Farther points: steep functions are refused that steps
-# resolve. Closer: beside those that they do not resolve, multipliers are wrong.
+# A field jumps if its relative change between two points exceeds `_JUMP`, and is more than `_STEEP`
+# times the distance of the points (in periods and magnitudes of the states). Smaller `_JUMP`:
+# rounding errors count as jumps. Larger: multipliers have errors of this size. Smaller `_STEEP`:
+# steep functions count as jumps although steps resolve them. Larger: multipliers are wrong near
+# steep functions that steps do not resolve.
 _JUMP = 1e-8
 _STEEP = 1e7
-# How often the quarter of an interval is taken in which the field changes most unlike in the
-# others. Fewer: jumps are missed behind other changes. More: time.
+# How often an interval is replaced by one of its quarters: the quarter in which the change of the
+# field differs most from the changes in the others. Fewer: a jump is missed if the field also
+# changes a lot elsewhere in the step. More: time.
 _QUARTERS = 20
 
 Points = Float[np.ndarray, "P 1+n"]
@@ -65,8 +77,9 @@ def program_of(s: Structure, a: int, function: Callable | None = None):
 
 
 def sudden(program: jax_compat.Program) -> Iterator[tuple[str, Any]]:
-    """The operations of a program that depend on its arguments, and may jump or have pulses: how
-    (`jax_compat.suddenness`), with the equation, or the call, by which the program does it."""
+    """Iterate over the operations of a program that depend on its arguments and may jump or have
+    pulses. Yields the kind of operation (a word of `jax_compat.suddenness`), and the equation or
+    call in the program."""
     moving = set(program.invars)
     for equation in program.eqns:
         moves = [jax_compat.is_variable(x) and x in moving for x in equation.invars]
@@ -84,7 +97,7 @@ def sudden(program: jax_compat.Program) -> Iterator[tuple[str, Any]]:
 
 
 def may_be_sudden(s: Structure, a: int, function: Callable) -> frozenset[str]:
-    """How operations of a module's function (structure, chart, *point) are `sudden`."""
+    """The kinds of `sudden` operations in a function (structure, chart, *point) of a module."""
     key = function, a, kind(s)
     if key not in _sudden:
         program = program_of(s, a, ft.partial(function, s, a))
@@ -99,8 +112,8 @@ _sudden: dict[tuple, frozenset[str]] = {}
 def passed_over(
     path: Any, u: Float[np.ndarray, " nu"], settings: Settings, linear: bool = False
 ) -> tuple[int, str] | None:
-    """The first step of a `Trajectory` that passes over a pulse of a field, a gain or a guard, and
-    the name of that.
+    """The first step of a `Trajectory` that passes over a pulse, and the name of the rate, gain or
+    guard that has the pulse; None if there is no such step.
 
     **Arguments:** `linear`: whether the path is linearized, so that steps must resolve jumps, too.
     """
@@ -120,8 +133,9 @@ def passed_over(
 def _passing(
     path: Any, a: int, rows, u, settings: Settings, linear: bool
 ) -> np.ndarray:
-    """Test which of the steps that begin at some rows, in chart a, pass over a pulse of each rate,
-    gain and guard: over what a polynomial through eight of its values in the step lacks."""
+    """Test which steps in chart a, given by the rows at which they begin, pass over a pulse of each
+    rate, gain and guard: the polynomial through eight of its values in the step misses the
+    pulse."""
     s = path.structure
     n = s.dims[a]
     m = n * (1 + s.nu)
@@ -168,8 +182,8 @@ def _passing(
         fastest = whole.largest[:, :n].max(axis=0)
         usual_rate = usual[:n] / np.ptp(path.t)
         fastest = np.maximum(fastest, usual_rate)
-        # (The root of the accuracy, as at a kink. Less: kinks are refused. More: multipliers are
-        # wrong beside steep functions that steps do not resolve.)
+        # (The square root of the accuracy, which is the error at a kink. Less: kinks are refused.
+        # More: multipliers are wrong near steep functions that steps do not resolve.)
         steep = np.sqrt(accuracy) * fastest
         is_steep = whole.beside[:, :n] > steep
         wrong[:, :n] |= is_steep
@@ -182,8 +196,8 @@ def _errors_of_gains(
     duration: Float[np.ndarray, "K 1"],
     probes: Float[np.ndarray, "p f2"],
 ) -> Float[np.ndarray, "K-1 j"]:
-    """Errors of the gains by the probes of pairs of steps; 0 where the second step of a pair
-    does not follow on the first.
+    """Errors of the gains, by the probes (see `_probes`) of two steps in a row; 0 where the two
+    steps do not follow each other.
 
     **Arguments:** `k`: the rows of the steps.
     """
@@ -196,20 +210,21 @@ def _errors_of_gains(
 
 
 class _Samples(NamedTuple):
-    """Where a step is looked at: eight points of a polynomial, and then F points in many pieces."""
+    """The points at which a step is evaluated: the eight points of a polynomial, then F points in
+    many small intervals."""
 
     nodes: np.ndarray
     """Parts of the step (8 + F, 1)."""
     polynomial: np.ndarray
-    """From values at the eight points to those of the polynomial at the others (F, 8)."""
+    """Matrix (F, 8) from values at the eight points to values of the polynomial at the F points."""
     weights: np.ndarray
-    """Of an integral over the step, at the F points."""
+    """Weights of the F points in an integral over the step."""
     probes: np.ndarray
     """See `_probes`."""
 
 
 def _samples(method: Method, only_poles: bool, linear: bool) -> _Samples:
-    """Where steps of a method are looked at."""
+    """The points at which steps of a method are evaluated."""
     pieces = 4 * _PIECES if linear else _PIECES
     if only_poles:
         pieces = _FEW
@@ -230,16 +245,16 @@ def _samples(method: Method, only_poles: bool, linear: bool) -> _Samples:
 
 
 class _Part(NamedTuple):
-    """Of K steps, by rate and gain (columns), or by guard."""
+    """Results for K steps (rows) and each rate and gain, or each guard (columns)."""
 
     moved: np.ndarray
-    """Integrals of their sizes."""
+    """Integrals of the absolute values."""
     lacks: np.ndarray
-    """Integrals that a polynomial, or a step of the method, lacks."""
+    """Part of the integrals that the polynomial, or a step of the method, misses."""
     beside: np.ndarray
-    """Largest distance from the polynomial."""
+    """Largest distance of the values from the polynomial."""
     largest: np.ndarray
-    """Largest size."""
+    """Largest absolute value."""
     falls: np.ndarray
     """Whether a guard falls below zero."""
 
@@ -263,8 +278,8 @@ def _points_within(
 
 
 def _falls(values: np.ndarray) -> np.ndarray:
-    """Test whether guards fall below zero in steps, where they are enabled: (K, F, guards and
-    predicates)."""
+    """Test in which steps guards fall below zero while they are enabled. `values`: (K, F, guards
+    and predicates)."""
     guards, enabled = np.split(values, 2, axis=2)
     largest = np.abs(guards).max(axis=(0, 1))
     is_low = guards < -_NEAR * largest
@@ -274,8 +289,10 @@ def _falls(values: np.ndarray) -> np.ndarray:
 
 
 def _probes(method: Method, within: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Errors of a method's integrals over parts of two steps, as weights of samples in these steps:
-    experiments and linearizations have other steps than the cycle, up to half as long again."""
+    """Weights of the samples in two successive steps, one row for each trial step within them. A
+    row times the samples of a rate is the error of the integral over the trial step if the method
+    computes it from its stages. (Experiments and linearizations take other steps than the cycle, up
+    to 1.5 times as long.)"""
     t = np.concatenate([within, 1 + within])
     rows = []
     for begin, length in product(np.arange(5) / 4, (1.0, 1.5)):
@@ -315,8 +332,8 @@ def column_name(s: Structure, a: int, j: int) -> str:
 def values_at(
     s: Structure, a: int, points: Points, u: Float[np.ndarray, " nu"], guards=False
 ):
-    """The field of chart a at points and its derivatives by the inputs; if so asked, the `guards`
-    and whether their predicates hold, too."""
+    """The field of chart a at points, and its derivatives by the inputs (gains); with `guards`,
+    also the guards and whether their predicates hold."""
 
     lanes = kernels.POINTS if may_have_pulses(s, a) <= POLES else kernels.WIDE
 
@@ -400,7 +417,8 @@ def jumps(
         distance = lengths.max(axis=2, keepdims=True)
         usual = changes.mean(axis=0)
         uneven = np.abs(changes - usual) / limit
-        # The quarter of each interval in which the field changes most unlike in the others.
+        # The quarter of each interval in which the change of the field differs most from the other
+        # quarters.
         worst = uneven.max(axis=2).argmax(axis=0)
         here = np.arange(len(low))
         low = points[worst, here]
@@ -428,8 +446,8 @@ def has_kinks(s: Structure) -> bool:
 
 
 def lines_of_jumps(s: Structure, a: int) -> list[str]:
-    """The lines of code by which the field of a chart may jump: those that decide, if there are
-    any."""
+    """The lines of code at which the field of a chart may jump. If there are decisions (`where`,
+    comparisons), only their lines."""
     decisions = []
     others = []
     for name, equation in sudden(program_of(s, a)):

@@ -1,9 +1,11 @@
 """The functions whose zeros end a step: guards, and the level function of the target section.
 
-Here they are only evaluated: values and rates (`ChartFlow.watch`), and the zero near a given state
-(`ChartFlow.locate`, by which crossings get their times and derivatives). Whether a function has
-crossed zero within a step is decided in `search/`, and by `itinerary/flags.py`. All are signed so
-that they fall at their event: with a wrong sign, events are missed or happen at once.
+Here these *watched functions* are only evaluated. The search calls `ChartFlow.watch` for values and
+rates; the search and the replay call `ChartFlow.locate` for the zero near a given state, from which
+crossings get their times and derivatives. Whether a function has crossed zero within a step is
+decided in `search/accept.py`, and in `itinerary/flags.py` for trajectories that follow an
+itinerary. All watched functions are signed so that they fall at their event: with a wrong sign,
+events are missed or happen at once.
 """
 
 from typing import NamedTuple
@@ -35,9 +37,9 @@ from .target import AbstractLevels, Target
 
 
 class Watch(NamedTuple):
-    """Watched functions at a point, signed so that they fall at their event: one row for each
-    transition, and a last one for the target's level. Rows without meaning in a lane's chart have
-    value 1 and rate 0."""
+    """Values and rates of watched functions, signed so that they fall at their event. There is a
+    row for each transition, and a last row for the target's level. Rows of other charts than a
+    lane's own have the value 1 and the rate 0."""
 
     value: Float[Array, "W L"]
     rate: Float[Array, "W L"]
@@ -46,7 +48,7 @@ class Watch(NamedTuple):
 def chart_field(
     s: Structure, a: int, u: AnyInputs, some: Mask | None = None
 ) -> LaneField:
-    """Field of chart a over lanes; on the host for `some` lanes only, if not all are needed."""
+    """Field of chart a over lanes; on the host only for the lanes `some`, if not all are needed."""
     if on_host(u):
         return lambda t, q: kernels.field(s, a, t, q, u, some)[:, 0]
     field = s.by_lane(lambda s, t, q, u: s.field(a, t, q, u), name=("field", a))
@@ -60,7 +62,7 @@ class Located(NamedTuple):
     """Time from the start to the zero."""
     q: States
     f: States
-    """The field there."""
+    """The field at the zero."""
     last: Times
     """The part of `past` that the second of two corrections added."""
     error: States
@@ -68,8 +70,8 @@ class Located(NamedTuple):
 
 
 class ChartFlow(NamedTuple):
-    """The field and the watched functions of one chart, under the inputs of lanes and for their
-    targets: levels by index."""
+    """The field and the watched functions of one chart. Inputs and targets are those of the lanes;
+    a target gives its level function by index."""
 
     s: Structure
     a: int
@@ -102,7 +104,8 @@ class ChartFlow(NamedTuple):
 
     @property
     def rows(self) -> list[int]:
-        """Rows of a `Watch` that have a meaning in the chart: guards, and the target's level."""
+        """Rows of a `Watch` that belong to the chart: its guards, and the target's level if the
+        chart has one."""
         rows = list(self.s.guards(self.a))
         if self.has_level:
             rows.append(len(self.s.transitions))
@@ -155,9 +158,10 @@ class ChartFlow(NamedTuple):
     ) -> Located:
         """The zero of watched function `which` (-1: none) near (t, q), where the field is f.
 
-        Two corrections: a short step of the known length `first` (default: Newton's), then a Newton
-        step. At the crossing itself (up to rounding) they change nothing, but carry the derivatives
-        of its time and state exactly, to second order: this is the saltation formula.
+        Two corrections are made: a short step of the length `first` (default: Newton's), then a
+        Newton step. If (t, q) is at the crossing up to rounding, they do not change it, but their
+        derivatives are the exact first and second derivatives of the time and the state of the
+        crossing: this is the saltation formula.
         """
         field = self.field
         rows = self.rows
@@ -184,7 +188,7 @@ class ChartFlow(NamedTuple):
 def chart_flow(
     s: Structure, a: int, here: Mask, u: Inputs, target: Target
 ) -> ChartFlow:
-    """The `ChartFlow` of the lanes `here`; the others are taken along as copies of one of them."""
+    """The `ChartFlow` of the lanes `here`. Other lanes are replaced by copies of one of these."""
     flow = ChartFlow(
         s=s,
         a=a,
@@ -233,14 +237,15 @@ def watch(
 
 
 def no_events(s: Structure, t: Times) -> Watch:
-    """A `Watch` of lanes at times t whose rows have no meaning."""
+    """A `Watch` of lanes at times t in which no row belongs to a chart: values 1, rates 0."""
     xp = namespace(t)
     shape = (len(s.transitions) + 1, len(t))
     return Watch(xp.ones(shape), xp.zeros(shape))
 
 
 def write(out: Watch, rows: list[int], here: Mask, new: Watch) -> Watch:
-    """`out` with its `rows` replaced by those of `new` for the lanes `here`."""
+    """`out` with some rows replaced by those of `new`, for the lanes `here`. `rows`: the rows in
+    `out`."""
     value = put_rows(out.value, rows, here, new.value)
     rate = put_rows(out.rate, rows, here, new.rate)
     return Watch(value, rate)

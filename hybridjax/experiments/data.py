@@ -1,4 +1,10 @@
-"""Data of experiments on a hybrid system, on a linear model or in a laboratory."""
+"""`ExperimentData`: inputs and outputs of experiments on a hybrid system, on a linear model or in a
+laboratory.
+
+`run_experiments`, `simulate_experiments` and plants return it, users can make it from arrays, and
+all estimates take it. Signals are sampled at the sections of a limit cycle. An experiment that
+failed has a `result` code and NaN; estimates leave it out.
+"""
 
 import dataclasses
 from typing import Annotated, Any
@@ -24,7 +30,7 @@ from ..errors import DefinitionError
 from .record import SectionSeries
 
 
-# Inputs are opposite if their sum is this small, relative to their peak. Smaller: rounding of
+# Two inputs are opposite if their sum is below this part of their peak. Smaller: rounding of
 # recorded inputs separates pairs. Larger: even-order distortion is left in the odd part.
 _OPPOSITE = 1e-9
 

@@ -1,4 +1,7 @@
-"""The whole motion of a single experiment, of which data have the sections only."""
+"""The whole motion of a single experiment, between sections, too.
+
+`perturbed_trajectory` is for animations and figures: data of experiments have the sections only.
+"""
 
 from typing import Annotated
 

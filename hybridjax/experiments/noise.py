@@ -1,4 +1,10 @@
-"""Noise in experiments: random inputs, simulated linear models with them, errors of measurement."""
+"""Noise in experiments: random inputs (`ProcessNoise`), simulated linear models with such inputs
+(`simulate_experiments`), and errors of measurement (`add_noise`).
+
+`run_experiments` takes a `ProcessNoise`, and calls its `draw`. The noise of an experiment depends
+on the seed and on the index of the experiment only, so that any part of a set can be computed
+alone.
+"""
 
 import dataclasses
 from typing import Annotated, Literal
@@ -50,7 +56,7 @@ class ProcessNoise:
     memory: NonNegative = 0.0
 
     def __post_init__(self):
-        # (Numbers and tuples of them can be compared and written down, arrays cannot.)
+        # (As numbers and tuples, which can be compared and stored as JSON; arrays cannot.)
         plain = np.asarray(self.std).tolist()
         object.__setattr__(
             self, "std", tuple(plain) if isinstance(plain, list) else plain

@@ -1,8 +1,15 @@
-"""Experiments that follow a table of legs and events (`rows.py`), without a search.
+"""Experiments near a limit cycle, computed along a table of steps and events, without a search.
 
-All experiments are moved at once, in lanes on the last axis. A lane that does not follow the table
-is marked: a watched function has another sign than on the cycle, or has dipped through zero, a leg
-would last a negative time, a step has a larger error than planned, or an event was not found.
+`run.py` calls `program` (the compiled `follow_table`) with a table from `rows.py`. It returns the
+outputs at the sections, and which experiments have left the table; these are computed again by
+other programs. All experiments are moved at once: each is a *lane*, an entry on the last axis of
+arrays. Each row of the table moves the lanes that are at its *place* (section and number of events
+passed). A *leg* is the way from one event or section to the next.
+
+A lane has left the table if a watched function (a guard, or the level of a section) has another
+sign than on the cycle or has dipped below zero (`_has_left`), a leg would last a negative time, a
+step has a larger error than planned, or an event was not found. If results differ from those of a
+search, look first at `_has_left`, then at `_landed` (times of events).
 """
 
 import functools as ft
@@ -25,9 +32,9 @@ from .response import Course, Feedback, Response
 from .rows import BEGIN, Body, Form, Rows
 
 
-# The last correction of the time of an event may be this part of the period times the square root
-# of the accuracy: what it leaves is its square. Larger: errors that nobody reports. Smaller: more
-# experiments are searched for their events.
+# Limit of the last correction of the time of an event, in units of the period times the square root
+# of the accuracy. (After a correction, the error is about its square.) Larger: events have errors
+# that are not reported. Smaller: more experiments leave the table.
 _LAST = 5e-3
 
 
@@ -43,7 +50,7 @@ _CLASSICAL = Method(
 
 
 class Passage(NamedTuple):
-    """Experiments on their way, in L lanes."""
+    """The state of L experiments (lanes) between two rows of the table."""
 
     t: Float[Array, " L"]
     q: Float[Array, "d L"]
@@ -54,12 +61,12 @@ class Passage(NamedTuple):
     h: Float[Array, " L"]
     """Length of the last step."""
     value: Float[Array, "G L"]
-    """Watched functions where the last step began."""
+    """Watched functions at the beginning of the last step."""
     rate: Float[Array, "G L"]
     error: Float[Array, " L"]
-    """Error of this turn so far."""
+    """Error in the present period so far."""
     largest: Float[Array, " L"]
-    """Largest error of a turn."""
+    """Largest error in a period."""
     left: Bool[Array, " L"]
     """Whether the table was left."""
     output: Float[Array, "ny L"]
@@ -67,11 +74,12 @@ class Passage(NamedTuple):
     answer: Float[Array, "nu L"] | None
     """What a controller adds to the inputs."""
     controller: Float[Array, "c L"] | None
-    """Its states."""
+    """States of the controller."""
 
 
 class Kept(NamedTuple):
-    """A passage where the present leg began, to which an event beyond the section goes back."""
+    """The passage at the beginning of the present leg. If an event turns out to lie beyond the next
+    section, the lane goes back to it."""
 
     t: Float[Array, " L"]
     q: Float[Array, "d L"]
@@ -107,7 +115,7 @@ def follow_table(
     S, n, nu = u.shape
     moves = _Moves(course, plan, settings, feedback, form)
     branches = [moves.of(body) for body in form.bodies]
-    # Periods, then sections; lanes last.
+    # Axes: periods, sections, inputs, lanes.
     held = jnp.transpose(u, (1, 2, 0)).reshape(n // N, N, nu, S)
 
     def turn(carry, held):
@@ -154,12 +162,12 @@ _put = jax.lax.dynamic_update_index_in_dim
 
 
 def _at(x: Array, k: Int[Array, ""]) -> Array:
-    """Entry k, which is within bounds: `x[k]` would test that."""
+    """Entry k. (The index is known to be valid; `x[k]` would test it.)"""
     return jax.lax.dynamic_index_in_dim(x, k, 0, keepdims=False)
 
 
 class _Moves:
-    """What rows do."""
+    """The functions that rows of the table call."""
 
     def __init__(
         self,
@@ -209,7 +217,7 @@ class _Moves:
         )
 
     def of(self, body: Body):
-        """The function (row, inputs, passage, kept) of rows with this body."""
+        """The function (row, inputs, passage, kept) that computes rows with this body."""
         work = self._event if body.kind else self._leg
 
         def move(row: Rows, u, passage: Passage, kept: Kept):
@@ -261,7 +269,8 @@ class _Moves:
         return self._arrived(row, x), kept
 
     def _event(self, body: Body, row: Rows, u, x: Passage, kept: Kept, acts):
-        """An event, and the reset; or back to where the leg began."""
+        """An event with its reset. If the next section comes first, the lane goes back to the
+        beginning of the leg."""
         a = body.chart
         s = self.s
         b = s.chart_index(s.transitions[body.kind[0]].target)
@@ -274,7 +283,7 @@ class _Moves:
         member = Member(body.kind, row.place)
         reset = s.by_lane(lambda s, t, q, u: s.reset(member, t, q, u))
         after = reset(t, q + f * late, u)
-        # Where the next section comes first, the event waits.
+        # If the next section comes first, the event is left for a later row.
         due = t <= _at(self.ends, row.section)
         if self._has_level(a):
             due &= value[len(s.guards(a))] > 0
@@ -295,7 +304,7 @@ class _Moves:
         return _where(waits, back, moved), kept
 
     def _observed(self, a: int, row: Rows, u, q, x: Passage) -> Passage:
-        """The outputs at the section, for lanes that are there, and a controller's answer."""
+        """The outputs of lanes that are on a section, and the response of a controller to them."""
         observe = self.s.by_lane(lambda s, t, q, u: self.outputs(a, t, q, u))
         if self.feedback is not None:
             assert x.answer is not None and x.controller is not None
@@ -312,15 +321,16 @@ class _Moves:
         return x._replace(output=jnp.where(x.fresh, output, x.output))
 
     def _stepped(self, a: int, u, t, q, h):
-        """The state after a step, and its error relative to what is allowed."""
-        # (The step of diffrax's solver takes twice as long: it writes stages as `K.at[k].set`.)
+        """The state after a step, and the error of the step relative to the allowed one."""
+        # (Not by diffrax, whose step takes twice as long, since it writes stages by `K.at[k].set`.)
         field = self._field(a, u)
         end, error = looped_step(self.s.method(a), field, t, q, h)
         allowed = self.settings.rtol * size(self.settings, a, q, end)
         return end, jnp.max(jnp.abs(error) / allowed, axis=0, initial=0.0)
 
     def _landed(self, a: int, row: Rows, u, t, q):
-        """Time and state at the level near (t, q), and the last correction of the time."""
+        """Time and state at the zero of the row's watched function near (t, q), and the last
+        correction of the time."""
         field = self._field(a, u)
 
         def correct(_, carry):
@@ -364,7 +374,7 @@ class _Moves:
         return len(self.s.guards(a)) + self._has_level(a)
 
     def _unknown(self, lanes: int):
-        """Watched functions of which nothing is known, and their rates."""
+        """Placeholders for watched functions and their rates, before any is evaluated."""
         known = jnp.zeros((self.form.watched, lanes))
         return known + jnp.inf, known + 1.0
 
@@ -381,13 +391,13 @@ class _Moves:
 
         value, rate = jax.jvp(values, (t, q), (jnp.ones_like(t), f))
         more = (0, self.form.watched - len(value)), (0, 0)
-        # (Rates of what is not watched are 1: nothing divides by zero.)
+        # (Unused entries have the rate 1, so that nothing divides by zero.)
         value = jnp.pad(value, more, constant_values=jnp.inf)
         return value, jnp.pad(rate, more, constant_values=1.0)
 
     def _has_left(self, a: int, row: Rows, x: Passage, value, rate):
-        """Test whether a watched function has another sign than on the cycle, or a guard has passed
-        zero and come back in the last step."""
+        """Test which lanes have left the table: a watched function has another sign than on the
+        cycle, or a guard has fallen below zero and come back within the last step."""
         count = self._functions(a)
         guards = len(self.s.guards(a))
         signs = row.signs[:, None]
@@ -402,7 +412,7 @@ class _Moves:
 
 
 def _where(mask: Bool[Array, " L"], yes: Any, no: Any) -> Any:
-    """Of each lane one of two trees."""
+    """For each lane, the values of one of two trees."""
     return jax.tree_util.tree_map(ft.partial(jnp.where, mask), yes, no)
 
 

@@ -1,7 +1,13 @@
-"""Step schedules between sections, computed in advance on the limit cycle.
+"""Step schedules from section to section, computed in advance on the limit cycle.
 
-A plan gives first steps and error estimates, not control flow: experiments that take another path
-than the cycle are integrated as accurately, perhaps in more steps.
+`run.py` calls `plan_flow(placed, accuracy)` once for all experiments, and gets a `Stepping`: the
+tolerances and a `Plan`. The plan has, for each section, the length of the first step and how large
+error estimates of steps may be. It also converts error estimates of steps to errors of the outputs
+(`weight`). `make_plan` tries several *candidates* for each section (numbers of equal steps, or
+tolerances), on the cycle and near it, and takes the cheapest ones that keep the accuracy.
+
+A plan does not decide on events: experiments that leave the cycle are integrated as accurately,
+perhaps in more steps. If `ExperimentData.error` is wrong, look at `_impact` and `_accumulated`.
 """
 
 import contextlib
@@ -37,25 +43,26 @@ from ..orbits.scale import has_implicit
 from ..sections.placed import PlacedSections
 
 
-# Candidates for each section, the cheapest first: so many equal steps, or steps whose error
-# estimate is at most this part of the tolerance. Fewer: intervals take more steps than they need.
-# More: plans take longer to make.
+# Candidates for each section, the cheapest first: these numbers of equal steps; then steps whose
+# error estimate is at most these parts of the tolerance. Fewer: more steps than needed. More: plans
+# take longer to make.
 _EQUAL_STEPS = (1, 2, 3, 4, 6, 8)
 _TOLERANCES = (1.0, 1e-2, 1e-4)
-# Deviations, relative to the states' scales, for which steps are tried where inputs excite modes
-# that die out within a step: in charts with implicit methods. The first, larger: steps are shorter
-# than experiments need. Smaller: experiments far from the cycle take more. Between both, a mode is
-# hidden by the error on the cycle or is not; farther apart: what lies between is not tried.
+# In charts with implicit methods, inputs excite modes that die out within a step. Steps are
+# therefore also tried at deviations of these two sizes, relative to the states' scales. A larger
+# first number: steps are shorter than experiments need. Smaller: experiments far from the cycle
+# take more steps. At the second one, errors on the cycle hide such a mode; with a larger distance
+# between the two, sizes in between are not tried.
 _KICKS = (1e-3, 1e-6)
-# Rounding error at a section, relative to the states' scales: the tolerance of the reference
-# solution, and the least accuracy. Larger: errors near it are estimated wrongly. Smaller: rounding
-# exceeds estimates.
+# Tolerance of the reference solution, and least error at a section, relative to the states' scales.
+# Larger: small errors are estimated wrongly. Smaller: rounding errors exceed estimates.
 ROUNDING = 1e-13
-# Duration of the path to a level relative to that on the cycle, for which equal steps are made.
-# Smaller: experiments that take longer need one step more. Larger: steps are longer than planned.
+# Equal steps suffice for experiments whose way to a section takes up to this many times as long as
+# on the cycle. Smaller: more experiments need one step more. Larger: steps are longer than planned.
 _ROOM = 1.25
-# A step may have up to this many times its error estimate on the cycle if the accuracy allows it.
-# Smaller: experiments far from the cycle take more steps. Larger: their errors grow.
+# Steps of experiments may have up to this many times the error estimate of the step on the cycle,
+# if the accuracy allows it. Smaller: experiments far from the cycle take more steps. Larger: their
+# errors grow.
 _MOST_SLACK = 10.0
 # Periods over which errors are propagated; a geometric series stands for all later ones. Fewer:
 # errors are underestimated for multipliers near the unit circle. More: plans take longer to make.
@@ -63,21 +70,23 @@ _PERIODS = 8
 # Safety factor of error estimates. Smaller: experiments far from the cycle exceed their estimates.
 # Larger: `ExperimentData.error` is pessimistic.
 _CAUTION = 3.0
-# Errors of different sections cancel in part, by at most this ratio in estimates. Larger: estimates
-# are too small if they cancel on the cycle only. Smaller: estimates are pessimistic.
+# Errors of different sections partly cancel. Estimates assume that this makes the sum smaller by at
+# most this factor. Larger: estimates are too small if errors cancel on the cycle only. Smaller:
+# estimates are pessimistic.
 _MOST_CANCELLATION = 30.0
 # Least error estimate of a step, relative to the tolerance. Smaller: weights of steps without error
 # overflow. Larger: the errors of accurate steps are overestimated.
 _LEAST_SHARE = 1e-6
-# Newton's guess of the time to the next level is used if it is wrong by a smaller factor. Larger:
-# bad guesses set the length of the last step. Smaller: good ones are not used.
+# Newton's guess of the time to the next section is used if it is wrong by less than this factor.
+# Larger: bad guesses set the length of the last step. Smaller: good guesses are not used.
 _WORST_GUESS = 3.0
 
 Accuracy = Annotated[
     float, Number("a number from 1e-13 to 0.01", low=ROUNDING, high=1e-2)
 ]
-"""Relative to the states' scales. Below the least, rounding is larger; above the largest, errors on
-the cycle differ from those of experiments beside it."""
+"""Accuracies that may be asked for, relative to the states' scales. Below the least, rounding
+errors are larger. Above the largest, errors on the cycle differ from those of experiments near
+it."""
 
 
 class Plan(eqx.Module):
@@ -88,9 +97,10 @@ class Plan(eqx.Module):
     - `h`: first step. `lead`: time to section k + 1 as a multiple of Newton's guess at section k.
     - `slack`: a step's error estimate may be this many times the tolerance.
     - `weight`: true error per embedded error estimate (relative to the tolerance), measured on the
-        cycle and relative to the states' scales: the largest that it ever leads to at a later
-        section, summed over all periods as if each made the same error.
-    - `least`: error of experiments whose steps seem to have none, in charts with implicit methods.
+      cycle and relative to the states' scales: it is the largest error that the step causes at any
+      later section, if each period makes the same error.
+    - `least`: least error estimate, for experiments in charts with implicit methods whose steps
+      seem to have no error.
     """
 
     h: Float[Array, " N"]
@@ -100,7 +110,8 @@ class Plan(eqx.Module):
     least: Float[Array, ""]
 
     def stride(self, k: int | Int[Array, ""], lanes: int) -> Stride:
-        """Return the first step and its limits at section k, for so many lanes."""
+        """Return the first step and its limits at section k, for a number of experiments
+        (lanes)."""
 
         def fill(x):
             return jnp.full(lanes, x[k])
@@ -116,7 +127,7 @@ def make_plan(
 ) -> Plan:
     """Return the cheapest schedule that keeps the accuracy.
 
-    **Arguments:** `accuracy`: of (t, q) at every later section, relative to `scale`.
+    **Arguments:** `accuracy`: largest error of (t, q) at every later section, relative to `scale`.
 
     **Raises:** `ComputationError` if no candidate reaches the next section.
     """
@@ -139,8 +150,8 @@ def make_plan(
     _require_ways(largest)
     best, total = _cheapest(largest, accuracy)
     section = np.arange(placed.n_sections)
-    # Small deviations, whose errors may be hidden by those on the cycle, have at most the least; it
-    # holds the cycle's own, whose stiff states are less accurate than its others.
+    # Errors of small deviations may be hidden by the errors on the cycle itself: `least` is a lower
+    # bound of estimates, from both.
     least = np.zeros(())
     if ways.estimate.shape[1] > 1:
         after = np.roll(section, -1)
@@ -152,13 +163,14 @@ def make_plan(
     large = slice(1 + placed.structure().nu)
     impact = impacts[best, large, section].T
     estimate = np.maximum(ways.estimate, _LEAST_SHARE)[best, large, section].T
-    # Errors of different sections cancel in part, in experiments almost as they do on the cycle.
+    # Errors of different sections partly cancel, in experiments almost as on the cycle.
     accumulated = _accumulated(J, error[best, 0, section], scale)
     together = _CAUTION * accumulated / impact[0].sum()
     weight = (impact / estimate).max(axis=0)
     weight = weight * np.maximum(together, 1 / _MOST_CANCELLATION)
 
-    # Lanes that are not on the cycle may use a section's share of the accuracy in any case.
+    # Experiments may use a section's full share of the accuracy, even if the cycle itself has a
+    # smaller error there.
     share = np.minimum(accuracy * estimate[0] / impact[0], 1.0)
     share = share / len(section)
     spare = np.clip(accuracy / total, _LEAST_SHARE, _MOST_SLACK)
@@ -169,8 +181,9 @@ def make_plan(
 
 
 def _impacts(ways: "_Ways", J, error, scale) -> Float[np.ndarray, "K M N"]:
-    """Return the largest later errors that each candidate causes from each start: infinite where it
-    does not arrive, and 0 for a deviation from which the reference does not arrive, either."""
+    """Return the largest later errors that each candidate causes from each start. The error is
+    infinite if the candidate does not reach the next section, and 0 if even the reference does
+    not."""
     impact = np.maximum(_impact(J, error, scale), np.finfo(float).eps)
     impact = np.where(np.isnan(impact), np.inf, impact)
     reference = ways.ends[0, -1]
@@ -192,8 +205,8 @@ def _require_ways(impact: Float[np.ndarray, "K N"]) -> None:
 def _cheapest(
     impact: Float[np.ndarray, "K N"], accuracy: float
 ) -> tuple[Int[np.ndarray, " N"], float]:
-    """Return the candidate of each section, and the sum of their impacts: the cheapest ones for the
-    largest share of the accuracy that keeps this sum."""
+    """Return a candidate for each section, and the sum of their later errors. They are the cheapest
+    ones whose sum keeps the accuracy."""
     N = impact.shape[1]
     section = np.arange(N)
     most_accurate = np.argmin(impact, axis=0)
@@ -213,16 +226,16 @@ class _Ways(NamedTuple):
     ends: Float[Array, "n B M N"]
     """(t, q) after each of K candidates and the reference; NaN for those that do not arrive."""
     estimate: Float[Array, "K M N"]
-    """Error estimates of the ways to go, relative to the tolerance."""
+    """Error estimates of the candidates, relative to the tolerance."""
     first: Float[Array, "K N"]
-    """Their first steps."""
+    """First steps of the candidates."""
     slack: Float[Array, " K"]
     lead: Float[Array, " N"]
 
 
 def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]:
-    """Return inputs that cause deviations: none, and where methods are implicit, of each size by
-    each input."""
+    """Return inputs that cause deviations. The first is zero; with implicit methods, each input
+    follows at each of the sizes `_KICKS`."""
     s = placed.structure()
     nu = by_input.shape[2]
     if not has_implicit(s):
@@ -320,8 +333,8 @@ def _lead(placed: PlacedSections, target):
 
 
 def _impact(J, error, scale) -> Float[np.ndarray, "*K N"]:
-    """Return the largest later errors that errors of the interval after section k (*K, N, n) cause,
-    relative to the scales."""
+    """Return the largest errors at later sections, relative to the scales, that errors (*K, N, n)
+    of the intervals after the N sections cause."""
     N = len(scale)
     after = np.roll(scale, -1, axis=0)
     # (All errors of a section side by side: one product of matrices for each.)

@@ -1,4 +1,9 @@
-"""Recorded inputs and outputs at the sections of a cycle, of any length and with gaps."""
+"""`SectionSeries`: one record of inputs and outputs at the sections of a cycle, of any length and
+with gaps.
+
+Data of experiments and of recordings are made of such records (`HasRecords`). Fits to time series
+call `uninterrupted_records` to get records without unknown inputs. Gaps are NaN.
+"""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
@@ -129,8 +134,8 @@ RecordedData = HasRecords | Annotated[Iterable[HasRecords], Stream(HasRecords, "
 def uninterrupted_records(data: RecordedData) -> list[SectionSeries]:
     """Return all records, cut at unknown inputs: no input in the result is NaN.
 
-    The output at an unknown input is not used, as it may depend on it directly, nor are those up to
-    `lead` samples earlier.
+    The output at an unknown input is not used, since it may depend on this input directly. With
+    `lead`, the outputs up to `lead` samples earlier are not used, either.
 
     **Raises:** `DefinitionError` if nothing is left, or records differ in N, names, lead or drift.
     """
@@ -176,7 +181,8 @@ def average_cycle(
 
 def require_deviations(records: Sequence[SectionSeries]) -> None:
     """**Raises:** `DefinitionError` if an output is nearly the same in all cycles, though no drift
-    was declared and inputs change: it holds the limit cycle itself."""
+    was declared and inputs change: the output then contains the limit cycle itself instead of
+    deviations."""
     N = records[0].n_sections
     nu = len(records[0].inputs)
     values = np.concatenate([np.hstack([r.u, r.y]) for r in records])
@@ -189,7 +195,7 @@ def require_deviations(records: Sequence[SectionSeries]) -> None:
         power = np.nansum(values**2, axis=0)
         changes = np.nansum(deviations**2, axis=0) / power
     of_inputs = changes[:nu].min()
-    # (A response to inputs that nearly repeat may nearly repeat itself.)
+    # (If inputs nearly repeat, outputs may nearly repeat, too.)
     fixed = changes[nu:] < 0.01 * of_inputs**2
     if fixed.any():
         output = records[0].outputs[int(np.argmax(fixed))]

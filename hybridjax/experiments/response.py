@@ -1,8 +1,11 @@
-"""The response of a hybrid system around its limit cycle to inputs: many experiments, compiled.
+"""The response of a hybrid system around its limit cycle to inputs: many experiments in one
+program.
 
 `flow_batch` moves all experiments from section to section, each time by a search for events
-(`engine/move.py`) with the steps that `plan.py` has computed. `response_function` is the same with
-derivatives. Experiments that stay near the cycle take the faster way of `passage.py` instead.
+(`engine/move.py`), with the first steps of a plan (`plan.py`). Each experiment is a *lane*, an
+entry on the last axis of arrays. `run.py` calls it for experiments that leave the tables of
+`passage.py`. `response_function` is the same for users, with derivatives. `Course` has the data of
+the sections. An experiment that fails without need has its cause in `examined`, or in the search.
 """
 
 import dataclasses
@@ -44,9 +47,9 @@ from ..systems.system import HybridSystem, Output, OutputNames, arrays_of
 from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 
 
-# Steps that a derivative may use between two of as many sections, and its square in a period of the
-# cycle. Fewer: experiments far from the cycle fail at the limit on steps. More: derivatives need
-# more memory.
+# With derivatives, the limit on the number of steps: this number between two sections if there are
+# as many sections, or its square in a period. Fewer: experiments far from the cycle reach the
+# limit. More: derivatives need more memory.
 _STEPS = 32
 
 
@@ -62,10 +65,10 @@ class Response(NamedTuple):
     error: Float[Array, " S"]
     """Estimate of the largest error of (t, q) at any section, relative to the states' scales."""
     end: Float[Array, "S m"]
-    """Times and states on section 0 after the last sample, the time counted within one period as
-    that of the start is; NaN after a failure."""
+    """Times and states on section 0 after the last sample, with times counted within one period, as
+    at the start; NaN after a failure."""
     feedback: Float[Array, "S n nu"] | None = None
-    """What a controller added to the inputs."""
+    """Values that a controller added to the inputs."""
 
 
 class Feedback(NamedTuple):
@@ -77,7 +80,8 @@ class Feedback(NamedTuple):
     def answer(
         self, i: Array, state: Float[Array, "m S"], y: Float[Array, "ny S"]
     ) -> tuple[Float[Array, "nu S"], Float[Array, "m S"]]:
-        """Return what the controller adds to the inputs at section i, and its next state."""
+        """Return the values that the controller adds to the inputs at section i, and its next
+        state."""
         A, B, C, D, _ = (x[i] for x in self.matrices)
         deviation = y - self.on_cycle[i][:, None]
         answer = -(C @ state + D @ deviation)
@@ -88,8 +92,8 @@ class Feedback(NamedTuple):
 class Course(eqx.Module):
     """The sections on a limit cycle, as experiments need them.
 
-    **Fields:** `outputs`, what is recorded there; the others are those of `PlacedSections` and
-    `LimitCycle`.
+    **Fields:** `outputs`, the outputs that are recorded at the sections. The other fields are as in
+    `PlacedSections` and `LimitCycle`.
     """
 
     system: HybridSystem
@@ -155,7 +159,8 @@ def flow_batch(
     lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
 
     def examined(result, lanes, u, section):
-        """The results of lanes on a section: an event that happens there at once is missed."""
+        """The results of lanes on a section. (An event that is due at once on a section would be
+        missed: it is an error.)"""
         if not course.has_event_sections:
             return result
         at_event = (result == Result.OK) & (course.bound.event[section] >= 0)
@@ -180,7 +185,8 @@ def flow_batch(
         target = dataclasses.replace(target, event_sequence=sequence)
         stride = plan.stride(i, S)
         moved = move(s, lanes, u, target, settings, stride, result).moved
-        # An event may change places with a section, but none may be left out or come in addition.
+        # An event may happen before or after a section, but the number of events in a period must
+        # be that of the cycle.
         expected = course.lanes.events[j] + turns * one_turn
         wrong = jnp.abs(moved.lanes.events - expected) > 1
         result = update_result(moved.result, wrong, Result.EVENT_ORDER)

@@ -1,12 +1,16 @@
-"""The course of an experiment as a table: its legs and events from section to section.
+"""The course of an experiment as a table: its steps and events from section to section.
 
-Around a limit cycle charts and events follow each other as on the cycle. One turn is a table of
-rows, each of which moves all experiments at once (`passage.py`): a step in a chart, a correction of
-the time of an event, or an event. A *leg* lies between sections and events.
+Near a limit cycle, an experiment has the same charts and events as the cycle. One period is a table
+of *rows*, and each row moves all experiments at once (`passage.py`): it is a step in a chart, a
+correction of the time of an event, or an event. A *leg* is the way from one event or section to the
+next. `run.py` calls `tables(placed, plan)`, which returns a short and a long table; `_Writer`
+writes the rows.
 
-An event near a section may happen on its other side in some experiments. Then it has rows in both
-intervals: a row moves those experiments that have passed as many events as it says. An event that
-turns out to lie beyond the next section is undone.
+In some experiments, an event near a section may happen on the other side of the section. Such an
+event has rows in both intervals. Each row moves only the experiments at its *place*, that is, after
+a certain section and a certain number of events. If an event turns out to lie beyond the next
+section, it is undone. An experiment that leaves its table without need has its cause in the signs
+that are expected (`Rows.signs`) or in the rows that are written (`_Writer._interval`).
 """
 
 import dataclasses
@@ -24,21 +28,23 @@ from ..systems.transition import Scheduled
 from .plan import Plan
 
 
-# Newton steps on the guard after the last step to an event, by the method of the chart. A last one,
-# of Euler, follows. Fewer: experiments far from the cycle miss their event. More: events take
-# longer.
+# Number of Newton corrections of the time of an event, by the method of the chart. One correction
+# by an Euler step follows. Fewer: experiments far from the cycle miss their event. More: events
+# take longer.
 _CORRECTIONS = 2
-# Rows of a table are a multiple of this. More: arrays are longer than needed. Fewer: tables of
-# other lengths compile again.
+# Numbers of rows are rounded up to multiples of this. More: arrays are longer than needed. Fewer:
+# tables of other lengths are compiled again.
 _ROUND = 16
-# A guard whose value is below this part of its largest one in the chart may have either sign.
-# Larger: a guard that is passed is not noticed. Smaller: rounding at events is taken for a passage.
+# A guard that is smaller than this part of its largest value in the chart may have either sign.
+# Larger: a crossing is not noticed. Smaller: rounding errors at events count as a crossing.
 _NEAR_ZERO = 1e-7
-# The time to an event is Newton's guess times a factor from the cycle, if that is below this and
-# above its inverse. Larger: bad guesses set the length of steps. Smaller: good ones are not used.
+# The time to an event is Newton's guess times a factor, which is known from the cycle, if the
+# factor lies between this and its inverse. Larger: bad guesses set the length of steps. Smaller:
+# good guesses are not used.
 _WORST_GUESS = 3.0
-# An event has rows beyond a section that is nearer than this part of the interval. Smaller: some
-# experiments leave the table. Larger: more events have rows that nearly no experiment needs.
+# An event near a section may happen after it in some experiments. So it also has rows beyond the
+# section, if its distance from the section is below this part of the interval. Smaller: more
+# experiments leave the table. Larger: more rows that hardly any experiment needs.
 _NEAR_SECTION = 0.05
 
 
@@ -47,18 +53,19 @@ BEGIN = 0
 
 
 class Rows(NamedTuple):
-    """R rows of one turn; those of other kinds do not use a column."""
+    """R rows of one period. (A row does not use the columns that belong to rows of another
+    kind.)"""
 
     body: Int[np.ndarray, " R"]
     """Index among the bodies of the program."""
     section: Int[np.ndarray, " R"]
     """The section at which the interval begins."""
     at: Int[np.ndarray, " R"]
-    """Number of the place of experiments that the row moves: section and events passed."""
+    """Number of the place (section and events passed) whose experiments the row moves."""
     then: Int[np.ndarray, " R"]
-    """That of their place afterwards."""
+    """Number of the place of these experiments afterwards."""
     begins: Bool[np.ndarray, " R"]
-    """Whether the leg begins here; otherwise a step is as long as the last one."""
+    """Whether a leg begins with this row; otherwise its step is as long as the last one."""
     corrects: Bool[np.ndarray, " R"]
     """Whether a step is a correction of the time of an event."""
     arrives: Bool[np.ndarray, " R"]
@@ -66,27 +73,29 @@ class Rows(NamedTuple):
     target: Int[np.ndarray, " R"]
     """The row of the watched function whose zero is the end of the leg; -1 for a known time."""
     part: Float[np.ndarray, " R"]
-    """Length of a step, as a part of the time to the end of the leg (to a zero, Newton's guess)."""
+    """Length of a step, as a part of the time to the end of the leg. (If the leg ends at a zero,
+    this time is Newton's guess.)"""
     fixed: Float[np.ndarray, " R"]
-    """Length of a step where Newton's guess is bad; 0 where it is not."""
+    """Length of a step if Newton's guess is bad; 0 otherwise."""
     place: Int[np.ndarray, " R"]
-    """Of an event: index of the transition among those of its kind."""
+    """For an event: index of the transition among those of its kind."""
     may_wait: Bool[np.ndarray, " R"]
-    """Of an event: whether it may happen beyond the next section instead."""
+    """For an event: whether it may happen beyond the next section instead."""
     signs: Int[np.ndarray, "R G"]
-    """Signs of the watched functions of the chart where a row begins; 0 where they may have
-    either."""
+    """Expected signs of the watched functions (guards, and the level of the section) at the
+    beginning of a row; 0 if either sign is allowed."""
 
 
 class Body(NamedTuple):
-    """What rows of one kind do, for the compiler: legs in a chart, or events of a kind."""
+    """The kind of a row, for which one function is compiled: legs in a chart, or events of a
+    kind."""
 
     chart: int
     kind: Kind = ()
 
 
 class Form(NamedTuple):
-    """All of a table that a program is compiled for. (Hashable.)"""
+    """The static properties of a table, for which a program is compiled. (Hashable.)"""
 
     bodies: tuple[Body, ...]
     watched: int
@@ -106,7 +115,7 @@ class _Event(NamedTuple):
     """An event on the cycle."""
 
     section: int
-    """The section before it."""
+    """The section before the event."""
     t: float
     transition: int
     before: Float[np.ndarray, " d"]
@@ -119,7 +128,7 @@ class _Points(NamedTuple):
     """Watched functions at P points of the cycle."""
 
     newton: Float[np.ndarray, "P G"]
-    """Newton's guesses of the times to their zeros."""
+    """Newton's guesses of the times until watched functions are zero."""
     signs: Int[np.ndarray, "P G"]
 
     def part(self, points: slice) -> "_Points":
@@ -151,13 +160,12 @@ class Tables(NamedTuple):
     near: Table
     """For experiments near the cycle."""
     far: Table
-    """For those that leave it: with twice as many steps, and rows for each event in the intervals
-    before and after its own."""
+    """For experiments that leave the table `near`: with twice as many steps, and with rows for each
+    event also in the intervals before and after its own."""
 
 
 def tables(placed: PlacedSections, plan: Plan) -> Tables | None:
-    """The tables of one turn around the cycle by a step schedule; None if experiments cannot follow
-    one."""
+    """The tables of one period, by a step schedule; None if experiments cannot follow a table."""
     placed, plan = to_host((placed, plan))
     if not applies(placed.structure(), placed):
         return None
@@ -167,7 +175,7 @@ def tables(placed: PlacedSections, plan: Plan) -> Tables | None:
 
 
 def _of_length(table: Table, other: Table) -> Table:
-    """A table with at least as many rows as another has, repetitions of its last one."""
+    """A table, lengthened to the number of rows of another one by repetitions of its last row."""
     more = max(len(other.rows.body) - len(table.rows.body), 0)
 
     def repeat(x):
@@ -177,7 +185,7 @@ def _of_length(table: Table, other: Table) -> Table:
 
 
 class _Writer:
-    """Writes the rows of a table, one after the other."""
+    """Writes the rows of a table one by one."""
 
     def __init__(self, placed: PlacedSections, plan: Plan, spare: bool, density: int):
         self.placed = placed
@@ -200,7 +208,8 @@ class _Writer:
     def _watch_points(self) -> None:
         """Evaluate the watched functions at sections, and before and after events.
 
-        (All at once, for one scale of each guard: at an event alone it would be rounding.)
+        (All together, so that each guard has one scale: at its own event alone, a guard is a
+        rounding error.)
         """
         N = self.N
         events = self.events
@@ -293,7 +302,7 @@ class _Writer:
         return any(event.at_section and event.section == k for event in self.events)
 
     def _chart(self, passed: int) -> int:
-        """The chart after so many events."""
+        """The chart after a number of events."""
         if not self.events:
             return int(self.chart[0])
         event = self.events[(passed - 1) % len(self.events)]
@@ -357,7 +366,7 @@ class _Writer:
         return t, self.after, number
 
     def _to_section(self, k: int, count: int) -> None:
-        """Write the leg to the section after k, of experiments that have passed so many events."""
+        """Write the leg to the section after k, for experiments that have passed `count` events."""
         a = self._chart(count)
         is_own = count == self._passed(k + 1)
         has_event = count > self._passed(k)
@@ -396,7 +405,7 @@ class _Writer:
     ) -> None:
         """Write the steps of a leg of this duration on the cycle.
 
-        `newton`: Newton's guess of the duration there; None where it is not needed, or right.
+        `newton`: Newton's guess of the duration on the cycle; None if it is not needed or exact.
         """
         steps = max(1, int(np.ceil(duration / self.plan.h[k] - 1e-6)))
         steps *= self.density
@@ -468,7 +477,8 @@ class _Writer:
         return self.places.setdefault((section, passed), len(self.places))
 
     def _event_kind(self, g: int) -> tuple[int, Kind, int]:
-        """The chart that a transition leaves, its kind, and its index there."""
+        """The chart that a transition leaves, the kind of the transition, and its index within the
+        kind."""
         member: Member = self.s.member(g)
         a = self.s.chart_index(self.s.transitions[g].source)
         return a, member.kind, int(member.place[0])

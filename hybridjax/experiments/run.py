@@ -1,14 +1,16 @@
 """Batches of experiments on a hybrid system around its limit cycle (paper Sec. V).
 
-`run_experiments` (`stored.py`) lets `prepare` check its arguments and make a `Campaign`, whose
-method `run` computes any part of the experiments. Each batch is computed by one of three programs:
+`run_experiments` (`stored.py`) calls `prepare`, which checks the arguments and makes a `Campaign`.
+Its method `run` computes any part of the experiments, and returns `ExperimentData`. Experiments are
+computed in batches, by one of three programs:
 
-1. along a table of the steps and events of the cycle (`rows.py`, `passage.py`), if there is one;
-2. experiments that leave this table: along a longer table (`Campaign._completed`);
-3. those that leave it, too, and experiments without a table: by a search for events
-   (`response.py`).
+1. `_followed`: along a table of the steps and events of the cycle (`rows.py`, `passage.py`), if
+   there is one;
+2. `_completed`: experiments that leave this table, along a longer table;
+3. `_searched`: experiments that leave the longer table, too, and all experiments if there is no
+   table, by a search for events (`response.py`).
 
-All three agree within the accuracy asked for: to find a fault, run the same inputs by `_followed`
+All three agree within the accuracy asked for. To find a fault, run the same inputs by `_followed`
 and by `_searched`. Sizes of batches and chunks change the results by rounding only.
 """
 
@@ -62,17 +64,19 @@ _SAMPLES = Reals("experiments samples inputs", missing=True, infinite=True)
 DesignLike = Design | Annotated[np.ndarray | jax.Array, _SAMPLES]
 """A design, or inputs. (Arrays may lie on disk: their values are checked part by part.)"""
 
-# From so many samples in all, a search for events is compiled with optimized loops: that takes 5 s
-# longer, and saves 3 microseconds per sample. Fewer: short runs wait in vain. More: runs of 10 s
-# take twice as long.
+# From this number of samples on, the program with a search for events is compiled with optimized
+# loops. This takes 5 s longer, and saves 3 microseconds per sample. Fewer: short runs wait in vain.
+# More: runs of 10 s take twice as long.
 _LARGE = 2_000_000
-# Experiments per compiled call. On CPU: fewer pay more for the work that is done once for all of
-# them, more leave the cache. On accelerators: more need more memory.
+# Experiments in one compiled call. On CPU: with fewer, work that is done once for a call costs
+# more; with more, arrays do not fit the cache. On accelerators, more need more memory.
 _BATCH = 320
 _BATCH_ON_ACCELERATOR = 16384
-# Fewer experiments than this are not split among workers: smaller batches cost more than they gain.
+# Fewer experiments than this are not divided among workers: smaller batches cost more than they
+# gain.
 _UNDIVIDED = 32
-# Batches are multiples of this, the width of vector instructions: others take up to a third longer.
+# Sizes of batches are multiples of this, the width of vector instructions. Other sizes take up to a
+# third longer.
 _VECTOR = 8
 # Experiments of a chunk, also when inputs on disk are checked. More need more memory; fewer leave
 # batches and threads unfilled.
@@ -81,8 +85,7 @@ CHUNK = 2 * _BATCH
 
 @dataclasses.dataclass(frozen=True)
 class RunOptions:
-    """How experiments are run, with the defaults and the meaning that they have in
-    `run_experiments`."""
+    """Options of `run_experiments`, with the same defaults and meaning."""
 
     start: StartName = "cycle"
     discard: int | None = None
@@ -210,8 +213,9 @@ class Campaign:
     def _starts(
         self, u, first: int, execution: Execution
     ) -> tuple[Float[np.ndarray, "m S"], list | None]:
-        """Return times and states on section 0 at which experiments start, and if the search for
-        them has run the experiments themselves, all that `_flow` yields.
+        """Return times and states on section 0 at which experiments start. If the search for these
+        starts has already run the experiments, also return their responses (as `_flow` yields
+        them).
 
         **Raises:** `ComputationError` if a periodic response is not found near the predicted one.
         """
@@ -242,8 +246,9 @@ class Campaign:
         return start, parts if still and window.shape == u.shape else None
 
     def _deviations(self, shape: tuple[int, int, int], responses):
-        """Return deviations of outputs from the cycle (S, n, ny), codes, samples of failures,
-        errors, and what a controller added to the inputs, of such a shape."""
+        """Collect responses: deviations of outputs from the cycle (S, n, ny), result codes, samples
+        of failures, errors, and the values that a controller added to the inputs (S, n, nu).
+        `shape`: (S, n, nu)."""
         N = self.placed.n_sections
         base = self.at_sections.on_cycle
         S, n, _ = shape
@@ -290,8 +295,9 @@ class Campaign:
     def _completed(
         self, part: Response, left: np.ndarray, u, start, size: int
     ) -> Response:
-        """A response in which the experiments that have `left` their table are run again: along one
-        with more rows, in a batch of this size, and where they leave that too, by a search."""
+        """A response in which the experiments that have `left` their table are replaced. They are
+        run again along the longer table, in a batch of `size`; experiments that leave this one,
+        too, are run by a search."""
         name = "experiments far from the cycle"
         if len(left):
             tables = self._tables
@@ -310,7 +316,8 @@ class Campaign:
     def _followed(
         self, table: Table, u, start, execution: Execution, name: str
     ) -> Iterator[tuple[slice, Any]]:
-        """Yield rows, their `Response` along a table, and which have left it, batch after batch."""
+        """Yield, batch after batch, the rows, their `Response` along a table, and which experiments
+        have left the table."""
         further = table.form, table.rows, np.int32(table.count)
 
         def arguments(rows):
@@ -335,7 +342,7 @@ class Campaign:
         if self.feedback is not None:
             on_cycle = jax.numpy.asarray(self.at_sections.on_cycle)
             loop = from_host(Feedback(self.feedback, on_cycle))
-        # (Nobody changes them before the program is done, so they may share memory.)
+        # (The arrays are not changed before the program ends, so that they may share memory.)
         x, held = jax.device_put((start[:, rows], u[rows]))
         stepping = self.stepping
         return self.at_sections.course, stepping.plan, x, held, stepping.settings, loop
@@ -422,8 +429,8 @@ def _controller(
 def check_inputs(
     design: DesignLike, discard: int, n_sections: int, inputs: tuple
 ) -> Inputs:
-    """Return the inputs for N sections and the inputs of these names, with the first `discard`
-    cycles not for estimation.
+    """Return the `Inputs` of experiments, checked against the number of sections and the names of
+    inputs. The first `discard` cycles are not for estimation.
 
     **Raises:** `DefinitionError` if they do not fit, or hold NaN.
     """
@@ -472,7 +479,8 @@ class _AtSections(NamedTuple):
     course: Course
     on_cycle: Float[np.ndarray, "N ny"]
     given: tuple[str | Output, ...]
-    """The outputs by whose `id` this is found: they must not be collected."""
+    """The outputs. The cache key contains their `id`, so that they must not be
+    garbage-collected."""
 
 
 _SEARCH = Program(flow_batch, False)
@@ -493,7 +501,8 @@ def _with_rows(part: Response, rows: np.ndarray, new: Response) -> Response:
 
 
 def _round_up(count: int, most: int) -> int:
-    """The size of a batch for so many experiments: of few sizes, so that few are compiled."""
+    """The size of a batch for `count` experiments. There are few sizes, so that few programs are
+    compiled."""
     size = _VECTOR
     while size < count:
         size *= 2
@@ -508,7 +517,8 @@ def divide(S: int, execution: Execution) -> Execution:
         size = min(execution.batch, S)
     else:
         most = _BATCH if on_cpu() else _BATCH_ON_ACCELERATOR
-        # So many batches that all workers take equally many, and all batches of one size.
+        # The number of batches is a multiple of the number of workers, and all batches have one
+        # size.
         rounds = -(-S // (most * workers))
         size = max(-(-S // (rounds * workers)), min(_UNDIVIDED, S))
         size = min(-(-size // _VECTOR) * _VECTOR, max(S, 1))
@@ -526,9 +536,9 @@ def in_batches(
 ) -> Iterator[tuple[slice, Any]]:
     """Yield rows and the results of `program` for them, batch after batch.
 
-    **Arguments:** `program`: compiled, with experiments first in all that it returns. `arguments`:
-    returns its arguments for some experiments. `execution`: from `divide`.
-    `name`: of the experiments, for the progress line.
+    **Arguments:** `program`: a compiled function whose results have experiments on the first axis.
+    `arguments`: a function that returns the arguments of the program for some experiments.
+    `execution`: from `divide`. `name`: noun of the progress line.
     """
     size = execution.batch or S
 

@@ -1,4 +1,10 @@
-"""Initial conditions of experiments: on the limit cycle, or in a periodic response."""
+"""Initial conditions of experiments: on the limit cycle, or in a periodic response.
+
+`Campaign._starts` (`run.py`) calls `periodic_start` (the response that the linear model predicts)
+or `steady_start` (the true periodic response, by Newton's method with the Jacobian of the linear
+model). Both return times and states on section 0. If a transient is left in data, look at
+`steady_start`.
+"""
 
 from collections.abc import Callable
 from typing import Literal
@@ -18,12 +24,12 @@ from .plan import Stepping
 
 StartName = Literal["cycle", "periodic", "steady"]
 
-# Newton steps. Fewer: large inputs have no steady start. More: it takes longer to report that there
-# is none.
+# Largest number of Newton steps. Fewer: large inputs have no steady start. More: if there is no
+# steady start, this is reported later.
 MOST_STEPS = 12
 
-# Part of the accuracy up to which a Newton step is not taken, and experiments need not run again.
-# Larger: starts leave a transient. Smaller: experiments run again for nothing.
+# A Newton step below this part of the accuracy is not taken, so that experiments need not run
+# again. Larger: starts leave a transient. Smaller: experiments run again for nothing.
 _LAST = 1e-2
 
 # A linear model has at least one output. This one is defined in every chart.
@@ -64,9 +70,10 @@ def steady_start(
     start: Float[np.ndarray, "m S"],
     flow: Callable[[np.ndarray, np.ndarray], np.ndarray],
 ) -> tuple[Float[np.ndarray, "m S"], Float[np.ndarray, " S"], bool]:
-    r"""Return starts whose responses to a repeated window of `periods` periods are periodic, the
-    last Newton steps relative to the sizes of the states (NaN for experiments that fail), and
-    whether the last `flow` was that of all experiments from these starts.
+    r"""Return starts from which the responses to a window of `periods` periods, repeated, are
+    periodic. Also return the last Newton steps relative to the magnitudes of the states (NaN for
+    experiments that fail), and whether the last call of `flow` ran all experiments from these
+    starts.
 
     The Jacobian is that of the linearization, $\Phi^P$, as accurate as the response is linear.
 

@@ -1,8 +1,9 @@
-"""Experiments at once, in chunks, or in a Zarr store that any number of processes fills.
+"""`run_experiments`: all experiments at once, in chunks, or in a Zarr store that any number of
+processes fills.
 
-`run_experiments` is here. It leaves the experiments themselves to a `Campaign` (`run.py`), and
-decides only which of them run together, and where the records go. Stores, their description and
-interruptions are those of `_core/pieces/`, for which `ExperimentJob` is a job.
+The experiments themselves are computed by a `Campaign` (`run.py`). This file decides only which of
+them run together, and where the records go. `ExperimentJob` is what the general code for stores
+(`_core/pieces/`) asks for: the description of the experiments, and the records of each chunk.
 """
 
 import dataclasses
@@ -136,7 +137,7 @@ class StoredExperiments(Showable):
 
 
 class _Options(TypedDict, total=False):
-    """What `run_experiments` takes in any of its forms."""
+    """Options that all forms of `run_experiments` take."""
 
     start: StartName
     discard: Index | None
@@ -343,8 +344,8 @@ class ExperimentJob:
         )
 
     def arrays(self) -> list[np.ndarray]:
-        """Return the arrays that records depend on beside inputs and parameters: those of the
-        cycle, of the sections on it, of the step schedule and of the linearization."""
+        """Return the arrays on which records depend, in addition to inputs and parameters: those of
+        the cycle, its sections, the step schedule and the linearization."""
         leaves = jax.tree_util.tree_leaves(eqx.filter(self._computed(), eqx.is_array))
         return [np.asarray(x) for x in leaves]
 
@@ -370,7 +371,7 @@ class ExperimentJob:
 
     @property
     def description(self) -> dict[str, Any]:
-        """JSON from which the experiments can be told from others."""
+        """A JSON description of the experiments, by which a store recognizes them."""
         campaign = self.campaign
         placed = campaign.placed
         inputs = campaign.inputs

@@ -1,7 +1,11 @@
-"""Residuals and their Jacobian beside a known cycle, as one program that nothing is searched in.
+"""Residuals of a fit and their Jacobian near a known limit cycle, as one compiled program without a
+search.
 
-The cycle follows the route of the known one (`orbits/near.py`), and its sections the walk of the
-known ones (`sections/walk.py`). Cycles that leave either have a result code.
+`fit.py` makes a `Model` and calls it at each point of the parameters. The cycle at this point
+follows the *route* of a known cycle, that is, its recorded sequence of steps and events
+(`orbits/near.py`); its sections follow the *walk* of the known sections (`sections/walk.py`). If
+the cycle leaves all known routes, a search finds it, and it becomes one more known cycle. If
+residuals differ from those of a search, look at `_model`.
 """
 
 import collections
@@ -29,31 +33,31 @@ from .observations import ObservedHTF, ObservedSeries
 from .problem import FitProblem, evaluate
 
 
-# Evaluations of problems of a class after which they are compiled: compilation takes as long as so
-# many. Fewer: a program is compiled that few evaluations use. More: many fits, as of a bootstrap,
-# stay slow for longer.
+# Number of evaluations for one class of problems after which the program is compiled. (Compilation
+# takes about as long as these.) Fewer: programs are compiled for few evaluations. More: many fits,
+# as in a bootstrap, stay slow for longer.
 WORTH_COMPILING = 24
-# Directions that forward mode takes. More: a model with more free parameters needs no search, but
-# the memory of programs grows with their number.
+# Largest number of directions of forward mode. More: models with more free parameters can use
+# programs, whose memory grows with this number.
 _MOST_DIRECTIONS = 64
 
-# Known cycles of a fit. Fewer: fits whose events pass sections search anew each time. More: each
-# evaluation that leaves the first takes longer.
+# Largest number of known cycles of a fit. Fewer: fits in which events move across sections search
+# each time. More: evaluations that leave the first route take longer.
 _MOST_KNOWN = 4
 
 _evaluations: collections.Counter = collections.Counter()
 _shared = Recent(8)
-"""Known cycles, with what is repeated beside them, by the cycle from which fits begin and the
-families of sections."""
+"""Known cycles with their routes and walks, by the cycle from which fits begin and the families of
+sections."""
 
 
 class Beside(NamedTuple):
-    """A known cycle, and what cycles beside it repeat."""
+    """The route and the walks of a known cycle, which cycles near it follow."""
 
     known: LimitCycle
     route: Route
     walks: tuple[Walk, ...]
-    """To the sections of each family in the observations."""
+    """Walks to the sections of each family in the observations."""
 
 
 Known = tuple[LimitCycle, Beside]
@@ -61,15 +65,16 @@ Known = tuple[LimitCycle, Beside]
 
 
 class Model:
-    """Residuals and their Jacobian, by a program beside known cycles.
+    """Residuals and their Jacobian, by a program that follows known cycles.
 
-    Where the routes of all known cycles are left, the search finds the cycle, which becomes one
-    more of these; the program stays the same. Fits that begin from the same cycle share them.
+    If the routes of all known cycles are left, a search finds the cycle, which becomes a further
+    known cycle. The program does not change. Fits that begin from the same cycle share their known
+    cycles.
     """
 
     def __init__(self, problem: FitProblem, system: HybridSystem, known: LimitCycle):
-        """**Arguments:** `system`: that of the fit. Numbers that are not free are its own, also
-        where those of a known cycle differ."""
+        """**Arguments:** `system`: system of the fit. Parameters that are not free have its values,
+        even if those of a known cycle differ."""
         self._problem, self._system, self._known = problem, system, known
         self._on_device = on_device((problem, system))
         self._class = identity((on_device(known.return_map), self._on_device))
@@ -104,11 +109,13 @@ class Model:
 
     @property
     def _has_program(self) -> bool:
-        """Whether a program is worth its compilation, and its flags would tell all."""
+        """Whether a program is worth its compilation, and would notice every cycle that leaves its
+        route (see `has_route`)."""
         return self._can_repeat and _evaluations[self._class] > WORTH_COMPILING
 
     def _with_another(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
-        """The model by one known cycle more: the first, or one that a search finds at x."""
+        """The model at x by a further known cycle: the first one, or the cycle that a search finds
+        at x."""
         if not self._has_program:
             return None
         cycle = self._cycle_at(x, guess) if self._besides else self._known
@@ -130,8 +137,8 @@ class Model:
         return find_limit_cycle(system, guess, throw=False)
 
     def _evaluated(self, x: np.ndarray, guess: LimitCycle) -> "Evaluated | None":
-        """The model by a known cycle, which becomes the first to be tried; None if it leaves the
-        routes of all, or without a program."""
+        """The model at x by a known cycle, which will be tried first the next time. None if all
+        routes are left, or without a program."""
         if not self._has_program:
             return None
         problem, system = self._on_device
@@ -166,7 +173,7 @@ def _can_repeat(problem: FitProblem) -> bool:
 
 
 def _beside(problem: FitProblem, known: LimitCycle) -> Beside | None:
-    """What a fit repeats; None where its flags would not tell all."""
+    """Route and walks of a known cycle; None if a cycle could leave them unnoticed."""
     route = route_near(known)
     if route is None:
         return None

@@ -1,4 +1,12 @@
-"""Physical parameters from data, by Levenberg-Marquardt through the limit cycle."""
+"""`fit_model`: physical parameters from data, by Levenberg-Marquardt iterations through the limit
+cycle.
+
+It takes the stages in order: the problem with its free parameters (`_prepare`, `problem.py`),
+guesses (`_starts_around`), an iteration from each guess (`_descend`), and the best end as a
+`ModelFit` (`_of_end`). Data convert limit cycles to residuals (`observations.py`); residuals are
+evaluated in `beside.py` or `problem.py`. `identifiability` evaluates the Jacobian once, without a
+fit.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -42,13 +50,13 @@ Data = AbstractObservation | Sequence[AbstractObservation]
 # Distance of the other guesses from the first one, in coordinates: factors between exp(-0.2) and
 # exp(0.2). Larger: most of them have no limit cycle. Smaller: all end in the same minimum.
 _SPREAD = 0.2
-# Without standard deviations, no other guess is tried once the mean square of the residuals,
-# relative to that of the data, is below this. Larger: fits with errors count as perfect. Smaller:
-# perfect fits, with errors of rounding, do not.
+# If the data have no standard deviations, no further guess is tried once the mean square of the
+# residuals, relative to that of the data, is below this. Larger: fits with errors count as perfect.
+# Smaller: perfect fits with rounding errors do not.
 _PERFECT = 1e-12
-# With them, none is tried once the cost, which has a chi square distribution, is above its mean by
-# less than so many of its standard deviations. Larger: local minima are accepted. Smaller: global
-# ones are not, and all guesses are tried.
+# If the data have standard deviations, no further guess is tried once the cost exceeds its mean by
+# less than this many of its standard deviations. (It has a chi-square distribution.) Larger: local
+# minima are accepted. Smaller: global minima are rejected, and all guesses are tried.
 _LIKELY = 4.0
 
 # Cycles at the end of a fit are the same if their periods differ by less than this part. Larger:
@@ -307,14 +315,14 @@ class End(NamedTuple):
     """The result of one guess."""
 
     start: Float[np.ndarray, " p"]
-    """Coordinates of the guess,"""
+    """Coordinates of the guess."""
     x: Float[np.ndarray, " p"]
-    """and of the fit."""
+    """Coordinates of the fit."""
     cost: float
     """Infinite where there is no limit cycle, or no observation on it."""
     residuals: Float[np.ndarray, " r"]
     jacobian: Float[np.ndarray, "r p"]
-    """Their derivatives by the coordinates."""
+    """Derivatives of the residuals by the coordinates."""
     cycle: LimitCycle | None
     """A guess for the cycle of the fit; None for trajectories."""
     steps: int
@@ -365,7 +373,7 @@ def _summary(
 ) -> ModelFit:
     assert best.cycle is not None and near is not None
     cycle = _cycle_at(problem, system, best.x, near)
-    # (From afar, another cycle may be found.)
+    # (A search from a distant cycle may find another one.)
     period = float(best.cycle.period)
     is_same = abs(float(cycle.period) - period) <= _SAME_PERIOD * period
     if int(cycle.result) != Result.OK or not is_same:
@@ -393,7 +401,7 @@ def _of_end(
     if cycle is not None:
         fitted = cycle.system
         if result == Result.OK:
-            # (Inside of the iteration cycles have fewer checks: it may end at one that is none.)
+            # (During the iteration, cycles have fewer checks, so that the last one may be wrong.)
             result = int(cycle.result)
     else:
         assert isinstance(problem, TransientProblem)

@@ -1,4 +1,10 @@
-"""The result of a fit of physical parameters, and the combinations that data identify."""
+"""`ModelFit`: the result of a fit of physical parameters; and `Identifiability`, the combinations
+of parameters that data identify.
+
+`fit.py` makes both. `diagnose` finds combinations without effect from the singular values of the
+sensitivities, and `_readable` and `_rounded` bring them to a form with small integers.
+`ParameterFit` has what does not need the system: standard errors, confidence regions, comparisons.
+"""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -30,10 +36,10 @@ from .problem import DELAYS, FitProblem, of_system
 # Singular values of the sensitivities below this, or below this part of the largest one, are zero.
 # Larger: badly identified combinations count as unidentifiable. Smaller: rounding identifies them.
 _RANK = 1e-9
-# Entries of a direction this close to zero, or to ratios of integers with denominators up to the
-# largest one, are replaced by these (they have no unit); a basis is solved for entries whose
-# smallest singular value is above it. Larger: exponents that are none are printed as integers.
-# Smaller: rounding of derivatives is printed.
+# Entries of a direction (without unit) that are this close to zero, or to a ratio of integers with
+# a denominator up to `_LARGEST_DENOMINATOR`, are replaced by it. A basis is solved for entries
+# whose smallest singular value exceeds this. Larger: wrong exponents are printed as integers.
+# Smaller: rounding errors of derivatives are printed.
 _CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
 
 
@@ -48,10 +54,10 @@ class Identifiability(Showable, eqx.Module):
     **Fields:**
 
     - `names` (p,) of the parameters. `rank`: number of identified combinations.
-    - `singular_values` (p,) of S, the largest first. Where residuals are in units of standard
-        deviations, one over a singular value is the relative standard error of its combination.
-    - `unseen` (p - rank, p): a basis of the null space with as many zeros as possible, and small
-        integers where it has such.
+    - `singular_values` (p,) of S, the largest first. If residuals are in units of standard
+      deviations, the relative standard error of a combination is one divided by its singular value.
+    - `unseen` (p - rank, p): a basis of the null space with as many zeros as possible; its rows are
+      small integers if their ratios are.
     - `sensitivity` (r, p): S.
     """
 
@@ -109,7 +115,7 @@ def _readable(basis: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
 
 
 def _rounded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
-    """Return rows scaled to small integers where they are multiples of such."""
+    """Return rows scaled so that their entries are small integers, if their ratios allow it."""
     out = []
     for row in rows:
         nearest = [Fraction(x).limit_denominator(_LARGEST_DENOMINATOR) for x in row]
@@ -184,11 +190,11 @@ class ParameterComparison(Showable, eqx.Module):
 
 
 Truth = Union[HybridSystem, LimitCycle, "ParameterFit", Mapping[str, float]]
-"""Values of parameters by name, or what has them."""
+"""Values of parameters by name, or an object that has parameters with these names."""
 
 
 class ParameterFit(WithCost, Fit):
-    """What all fits of parameters share, with their system or without.
+    """Base class of fits of parameters, those with their system and those that were saved without.
 
     **Fields:**
 

@@ -1,4 +1,10 @@
-"""Data to which systems are fitted: each type converts a limit cycle to weighted residuals."""
+"""Data to which systems are fitted. Each type converts a limit cycle to weighted residuals.
+
+`fit_model` calls `prepare` once, outside of JAX, for checks; then `residuals(cycle)` at each point
+of the parameters, inside of a program. A further type of data is a subclass of
+`AbstractObservation`. A fit that is biased for one type of data has its cause in the `residuals` of
+this type.
+"""
 
 import abc
 from typing import Annotated
@@ -114,7 +120,7 @@ class ObservedHTF(AbstractObservation):
     weights: Float[Array, "M F ny nu"]
     weighted: Bool[Array, ""]
     most: Float[Array, ""]
-    """Largest mean square of the residuals that estimated variances explain."""
+    """Largest mean square of the residuals that the scatter of estimated variances can explain."""
     delay: Float[Array, "2"] | None
 
     def __init__(self, htf: HTF, sections: FamilyLike, delay: Delays | None = None):
@@ -352,8 +358,8 @@ class ObservedCycle(AbstractObservation):
 
 
 def _without_turns(cycle: LimitCycle, error: Float[Array, " N"]) -> Float[Array, " r"]:
-    """Errors of times without whole periods; of an autonomous cycle, whose zero of time may be any
-    moment, only their differences."""
+    """Errors of times modulo the period. For an autonomous cycle, whose zero of time is arbitrary,
+    only their differences."""
     apart = error if cycle.clocked else error - error[0]
     turns = jnp.round(apart / cycle.period)
     error = error - jax.lax.stop_gradient(turns) * cycle.period

@@ -1,4 +1,11 @@
-"""Weighted residuals of data as a function of free parameters, and their minimization."""
+"""Weighted residuals of data as a function of free parameters (`FitProblem`), and their
+minimization (`descend`).
+
+`fit.py` calls `free_parameters` and `descend`. Parameters are changed in coordinates x without
+bounds (`Parameters.encode`, `decode`). `evaluate` returns residuals and their Jacobian at x;
+`TransientProblem` does the same for trajectories, without a limit cycle. An iteration that ends too
+early has its cause in `descend`.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -28,28 +35,30 @@ from .observations import AbstractObservation, ObservedHTF
 from .transients import ObservedTrajectory, residuals_of, start_value, with_start
 
 
-# The iteration ends when a step changes no coordinate and no residual by more than this, in sum and
-# relative to it (they have no unit). Larger: parameters
-# without the digits that the data have. Smaller: steps that only change rounding errors.
+# The iteration ends when a step changes neither the coordinates nor the residuals by more than
+# this, absolutely and relatively (both have no unit). Larger: parameters are less accurate than the
+# data allow. Smaller: steps that only change rounding errors.
 _TOLERANCE = 1e-9
-# Evaluations of the model from one guess. Fewer: distant guesses do not converge. More: hopeless
-# ones take longer.
+# Largest number of evaluations of the model from one guess. Fewer: distant guesses do not converge.
+# More: hopeless guesses take longer.
 MAX_STEPS = 64
-# No step is taken along directions whose sensitivity is below this part of the largest one, and
-# none can improve the fit if it is below this. Larger: badly identified parameters keep their
-# initial values. Smaller: unidentifiable ones wander off.
+# No step is taken along directions whose sensitivity is below this part of the largest one. If even
+# the largest sensitivity is below this number, no step can improve the fit. Larger: badly
+# identified parameters keep their initial values. Smaller: unidentifiable parameters drift away.
 _RCOND = 1e-8
-# A step is accepted if the cost falls by this part of the predicted reduction; beyond a larger part
-# the damping falls, otherwise it grows. Lower: steps count that gain nothing, or swing about the
-# minimum. Higher: good ones are repeated, or made too short.
+# A step is accepted if the cost falls by the part `_ACCEPTED` of the predicted reduction. If it
+# falls by the part `_GOOD`, the damping is reduced, otherwise increased. Lower: steps without gain
+# are accepted, or steps oscillate about the minimum. Higher: good steps are repeated, or made too
+# short.
 _ACCEPTED, _GOOD = 0.01, 0.5
-# The first damping, and the factor by which it changes. Higher: more steps until it fits. Lower:
-# first steps that go too far, or more steps until it fits.
+# The first damping, and the factor by which it changes. Higher: more steps until the damping is
+# right. Lower: first steps are too long, or more steps until the damping is right.
 _DAMPING, _FACTOR = 3e-3, 4.0
 
 # Names of the entries of `ObservedHTF.delay` among the free parameters.
 DELAYS = "input_delay", "output_delay"
-# Between the name of a state and the number of the trajectory that starts there.
+# Text between the name of a state and the number of a trajectory, in names of unknown initial
+# states.
 AT_START = " at start "
 
 Observations = Sequence[AbstractObservation]
@@ -103,7 +112,7 @@ class Parameters(eqx.Module):
 
     @eqx.filter_jit
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
-        """Return coordinates of values, NaN for those outside of their bounds."""
+        """Return the coordinates of parameter values; NaN for a value outside of its bounds."""
         low, high, cases = self._bounds()
         up, down = values - low, high - values
         logarithms = [jnp.log(up / down), jnp.log(up), jnp.log(down)]
@@ -119,7 +128,8 @@ class Parameters(eqx.Module):
         )
 
     def _bounds(self) -> tuple[Array, Array, list[Array]]:
-        """Return bounds with zero for infinity; the cases of both, a lower one, an upper one."""
+        """Return the bounds with zero in place of infinity; and masks of parameters with both
+        bounds, a lower bound, and an upper bound."""
         low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
         lowest = jnp.where(low, self.low, 0.0)
         highest = jnp.where(high, self.high, 0.0)
@@ -237,9 +247,9 @@ class FitProblem(eqx.Module):
         return all(bool(observation.weighted) for observation in self.observations)
 
     def unit(self, cost: float, dof: float) -> float:
-        """Return the factor of covariances for the cost of a fit, from the cost relative to its
-        expected value: that of variances that are estimated, or this misfit where there are none
-        (NaN if no residual is left to estimate it)."""
+        """Return the factor of covariances of a fit, from its cost relative to the expected value.
+        With estimated variances, it corrects for their scatter; without variances, it is this ratio
+        itself (NaN if there are no degrees of freedom)."""
         misfit = cost / max(dof, 1)
         if not self.weighted:
             return max(misfit, np.finfo(float).tiny) if dof else np.nan
@@ -271,7 +281,7 @@ class FitProblem(eqx.Module):
 
 
 class TransientProblem(FitProblem):
-    """The same for trajectories, which need no limit cycle."""
+    """Weighted residuals of trajectories, which need no limit cycle."""
 
     system: HybridSystem
 
@@ -331,8 +341,8 @@ _not_on_host: set[tuple] = set()
 def evaluate(
     problem: FitProblem, x: Float[Array | np.ndarray, " p"], guess: LimitCycle
 ) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle]:
-    """Return residuals and Jacobian at x, from the host if it has these derivatives; and a guess
-    for parameters near x."""
+    """Return residuals and Jacobian at x, computed on the host if the derivatives are available
+    there; and a guess for parameters near x."""
     arguments = problem, jnp.asarray(x), guess
     with on_the_cpu():
         key, values = kind(arguments), None
@@ -358,13 +368,13 @@ def descend(
     Any, Float[np.ndarray, " r"], Float[np.ndarray, "r p"], LimitCycle | None, int, bool
 ]:
     """Return the end of the Levenberg-Marquardt iteration from x: coordinates, residuals and their
-    Jacobian, a guess for their cycle, number of evaluations, and whether it has converged. Other
-    ways to `evaluate` the model do as the function of that name.
+    Jacobian, a guess for their cycle, number of evaluations, and whether it has converged.
+    `evaluate`: another function in place of `evaluate` of this file.
 
-    The damping is relative to the largest sensitivity, so that units of the residuals do not count.
-    (`scipy.optimize.least_squares` takes 27 evaluations in place of 8 where the data identify only
-    the product of two parameters, and moves along what they do not identify, to 1e17 and 1e-17.)
-    The iteration runs on the host, so that only the model is compiled.
+    The damping is relative to the largest sensitivity, so that units of the residuals have no
+    effect. (If the data identify only the product of two parameters, `scipy.optimize.least_squares`
+    takes 27 evaluations instead of 8, and moves the two to 1e17 and 1e-17.) The iteration runs on
+    the host, so that only the model is compiled.
     """
     damping, steps = _DAMPING, 1
     r, J, near = evaluate(problem, x, guess)
@@ -384,13 +394,13 @@ def descend(
         predicted = (J @ change) @ (J @ change + 2 * r)
         gain = (r_new - r) @ (r_new + r)
         is_better = gain <= _ACCEPTED * predicted
-        # (Rounding decides whether a step of this size is accepted.)
+        # (For a step as small as this, rounding decides whether it is accepted.)
         done = _small(change, trial) and (_small(r_new - r, r_new) or not is_better)
         if is_better:
             x, r, J, near = trial, r_new, J_new, nearer
         damping *= 1 / _FACTOR if gain < _GOOD * predicted else _FACTOR
         if done:
-            # (Steps become short, too, where none helps: beside parameters without a cycle.)
+            # (Steps also become short where no step helps: near parameters without a cycle.)
             gain = r @ J @ step(_RCOND**2)
             converged = bool(gain <= _TOLERANCE * (1 + r @ r))
             return x, r, J, near, steps, converged

@@ -1,4 +1,9 @@
-"""A smooth stand-in for the largest modulus of the multipliers."""
+"""`spectral_radius`: a smooth upper bound of the largest modulus of the multipliers, for use in
+optimization.
+
+The largest modulus itself has no derivative where multipliers coincide. `_smooth_radius` solves for
+the bound by Newton's method.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +82,7 @@ def _smooth_radius(
     begin = jnp.log(
         jnp.maximum(true / jnp.sqrt(1 - smoothing / d), 1e-6 * jnp.linalg.norm(fixed))
     )
-    # Newton's method goes up from the lower bound and never beyond the root.
+    # (From the lower bound, Newton's method increases and never passes the root.)
     solver: optx.Newton = optx.Newton(rtol=1e-12, atol=1e-12)
     return jnp.exp(
         optx.root_find(excess, solver, begin, power, max_steps=64, throw=False).value

@@ -1,4 +1,10 @@
-"""Recorded trajectories that are no cycles: drops, first steps, transients."""
+"""`ObservedTrajectory`: recorded trajectories that are no cycles, such as drops, first steps and
+transients.
+
+`fit_model` calls `residuals_of` for each trajectory: the flow from its start (`orbits/flow.py`),
+with outputs at the measured times and times of events, minus the measurements. States at the start
+may be unknown (`start_value`, `with_start`).
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
@@ -25,12 +31,12 @@ from ..systems.system import Guess, HybridSystem
 from .observations import AbstractObservation, Deviations
 
 
-# The flow goes on after the last measurement for this part of the time until then. Larger: events
-# are passed that nobody has measured. Smaller: a measured event that comes later is missed, and a
-# fit does not come from there.
+# The flow ends later than the last measurement, by this part of the time until then. Larger:
+# further events that were not measured happen. Smaller: if a measured event comes too late for some
+# parameters, it is missed, and the fit cannot leave these parameters.
 _AFTER = 0.2
-# Events of which times are kept, besides as many as were measured. Fewer: a measured event that
-# others come before is missed. More: programs take longer.
+# Number of events whose times are kept, in addition to the number of measured events. Fewer: a
+# measured event is missed if many others come before it. More: programs take longer.
 _MORE_EVENTS = 32
 
 
@@ -60,7 +66,7 @@ class ObservedTrajectory(AbstractObservation):
     outputs: tuple[str, ...] = eqx.field(static=True)
     values: Float[Array, "K ny"]
     known: tuple[int, ...] = eqx.field(static=True, repr=False)
-    """Places of the values that are no NaN."""
+    """Indices of the values that are not NaN."""
     scale: Float[Array, " ny"]
     events: tuple[str, ...] = eqx.field(static=True)
     event_times: tuple[Float[Array, " E"], ...]
@@ -272,7 +278,7 @@ def _require_times(start: Guess, *lists: np.ndarray) -> None:
 def _samples(
     times: Any, outputs: tuple[str, ...], values: Any
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ny"]]:
-    """Times and samples; of no outputs if there are none.
+    """Times and samples; without outputs, empty arrays.
 
     **Raises:** `DefinitionError` if one of the three lacks, for a shape that does not fit, and if
     all samples are missing.
@@ -300,7 +306,7 @@ def _samples(
 def _sizes(
     name: str, std: Any, samples: Float[np.ndarray, "K ny"]
 ) -> Float[Array, " ny"]:
-    """Standard deviations of each output, or its rms.
+    """Standard deviation of each output; if none is given, its rms value.
 
     **Raises:** `DefinitionError` for another number of them, and for an output that is zero
     throughout, without one.

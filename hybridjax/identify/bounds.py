@@ -1,4 +1,10 @@
-"""The smallest standard errors that an experiment allows, before it is made."""
+"""`cramer_rao`: the smallest standard errors of multipliers that an experiment allows, before it is
+made.
+
+It takes the exact model and HTFs with the variances that they will have, and returns a
+`MultiplierEstimate`. With the matrices as unknowns (`fit_ldtp`), `_with_matrices` computes the
+bound; otherwise it is that of `fit_multipliers`.
+"""
 
 import dataclasses
 from typing import Literal
@@ -38,12 +44,13 @@ def cramer_rao(
 
     - `model`: the true system. `htf`: frequencies, harmonics and `variance` of the experiment; its
       H is not used.
-    - `estimator`: the function whose unknowns count. For "fit_multipliers" they are the multipliers
-      and all numerators: the bound is the inverse of $J^T J$, where J is the derivative of the HTFs
-      in units of their standard deviations, projected orthogonally to all changes of the
-      numerators. For "fit_ldtp" they are the matrices A[n], B[n], C[n] (and D[n], if the model has
-      any), of the minimal part of the model. The squared ratio of both standard errors is the
-      factor by which the structure reduces the amount of data. Default: "fit_multipliers".
+    - `estimator`: the estimation function for which the bound holds. For "fit_multipliers" they are
+      the multipliers and all numerators: the bound is the inverse of $J^T J$, where J is the
+      derivative of the HTFs in units of their standard deviations, projected orthogonally to all
+      changes of the numerators. For "fit_ldtp" they are the matrices A[n], B[n], C[n] (and D[n], if
+      the model has any), of the minimal part of the model. The square of the ratio of the two
+      standard errors tells how many times more data "fit_multipliers" needs than "fit_ldtp".
+      Default: "fit_multipliers".
     - `extra_lags`: degree of the numerators beyond d N, of "fit_multipliers". Default: N.
 
     **Returns:** `hj.identify.MultiplierEstimate`: the true `multipliers` (d,) with the smallest

@@ -2,8 +2,11 @@ r"""The denominator $\chi$ that all transfer functions of a periodic system shar
 
 $$\chi(q^{-N}) = 1 + c_1 q^{-N} + \ldots + c_d q^{-dN} = \prod_i (1 - \lambda_i q^{-N})$$
 
-Its coefficients c are real, its roots are the d non-zero Floquet multipliers. The covariances of
-estimated coefficients hold whatever the errors are.
+Its coefficients c are real, and its roots are the d non-zero Floquet multipliers. All fits with
+this denominator call this file: `multipliers_of` and `coefficients_of` convert, `sandwich` and
+`block_freedom` give the covariance of estimated coefficients and its degrees of freedom, whatever
+the distribution of the errors is. A wrong error bar has its cause in `sandwich`, or in the scores
+that it gets.
 """
 
 from typing import NamedTuple
@@ -11,17 +14,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
+from ..linear.multipliers import largest_first
 from .descent import ROUNDING, Coefficients
 
 
-# Part of a response that is left when it counts as forgotten (the number of cycles whose scores
-# are correlated). Smaller: more lags, and covariances that scatter more; larger: they miss more.
+# A response counts as forgotten when this part of it is left. (Scores of cycles are correlated
+# until then.) Smaller: more lags, so that covariances scatter more. Larger: a part of each
+# covariance is missed.
 _FORGOTTEN = 0.1
-# Largest modulus of a multiplier that is assumed before a fit: 0.99 takes 230 cycles. Larger:
-# simulations from starts overflow; smaller: slow modes start far from their minimum.
+# Largest modulus of a multiplier at the start of a fit (with 0.99, a tenth is left after 230
+# cycles). Larger: simulations overflow. Smaller: slow modes start far from their minimum.
 SLOWEST = 0.99
-# Smallest share of its errors that a fit leaves to a block or line. Smaller: blocks that alone
-# determine a coefficient dominate the covariance; larger: covariances are too small.
+# A fit reduces the residuals of a block or line, and a correction divides by the share that is
+# left. At least this share is assumed. Smaller: blocks that alone determine a coefficient dominate
+# the covariance. Larger: covariances are too small.
 _SMALLEST_REMAINDER = 0.1
 
 
@@ -53,17 +59,15 @@ def coefficients_of(multipliers: Complex[np.ndarray, " d"]) -> Float[np.ndarray,
 
 
 def multipliers_of(coefficients: Coefficients) -> Complex[np.ndarray, " d"]:
-    """Return the multipliers by decreasing modulus, of each pair the upper one first."""
+    """Return the multipliers by decreasing modulus, of each conjugate pair the upper one first."""
     roots = np.roots([1.0, *coefficients]).astype(complex)
     at_zero = len(coefficients) - len(roots)  # numpy drops these
     roots = np.pad(roots, (0, at_zero))
-    by_modulus = -np.abs(roots)
-    order = np.lexsort((-np.imag(roots), by_modulus))
-    return roots[order]
+    return roots[largest_first(roots)]
 
 
 class Covariance(NamedTuple):
-    """A covariance matrix, infinite where nothing is known, and how well it is known."""
+    """A covariance matrix, which is infinite where nothing is known, and its degrees of freedom."""
 
     matrix: Float[np.ndarray, "d d"]
     dof: float
@@ -83,8 +87,8 @@ def sandwich(
 
     **Arguments:** `curvature`: K. `gradient`: M, the covariance of the gradient. `shares`: the
     expected contributions of independent parts, if M was estimated from these. The degrees of
-    freedom are then the number of parts that contribute: one over the sum of the squares of their
-    shares (Satterthwaite 1946). Default: M is exact.
+    freedom are then one over the sum of the squared shares (Satterthwaite 1946). Default: M is
+    exact.
     """
     values, vectors = np.linalg.eigh(curvature)
     if not values[0] > ROUNDING * values[-1]:
@@ -101,7 +105,7 @@ def sandwich(
 def correlated_cycles(multipliers: Inexact[np.ndarray, " d"], cycles: int) -> int:
     """Return the cycles after which a tenth of the slowest response is left.
 
-    At most a quarter of a record.
+    The result is at most a quarter of `cycles`.
     """
     slowest = np.clip(np.abs(multipliers).max(), _FORGOTTEN, SLOWEST)
     # (Sums over fewer pairs scatter more.)
@@ -130,7 +134,8 @@ def in_blocks(
 def inverse_of_remainder(
     taken: Float[np.ndarray, "B k k"], power: float = 1.0
 ) -> Float[np.ndarray, "B k k"]:
-    """Return (1 - taken)^-power, `taken` being the share of a block's errors that a fit takes."""
+    """Return (1 - taken)^-power, where `taken` is the share by which a fit reduces the errors of a
+    block."""
     remainder = np.eye(taken.shape[1]) - taken
     values, vectors = np.linalg.eigh(remainder)
     values = np.maximum(values, _SMALLEST_REMAINDER)
@@ -142,11 +147,10 @@ def block_freedom(
 ) -> float:
     """Return the degrees of freedom of a covariance from the scores of independent blocks.
 
-    From their dispersion (Pan and Wall 2002), at most those of Gaussian errors (Satterthwaite
-    1946).
+    They follow from the dispersion of the scores (Pan and Wall 2002), and are at most those for
+    Gaussian errors (Satterthwaite 1946).
 
-    **Arguments:** `share`: the expected contribution of each block, in units in which they add up
-    to one.
+    **Arguments:** `share`: the expected contribution of each block; contributions add up to one.
     """
     d = score.shape[1]
     inverse = np.linalg.pinv(score.T @ score)

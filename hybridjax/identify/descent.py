@@ -1,4 +1,10 @@
-"""Nonlinear least squares whose linear unknowns are eliminated, and linearized least squares."""
+"""Least squares: nonlinear by scipy's trust-region method (`least_squares`), and linearized
+(`NormalEquations`, `Spread`).
+
+Fits with eliminated linear unknowns call `least_squares` with a function that returns residuals and
+their Jacobian. `fit_ldtp` makes its own steps from `NormalEquations`. If a fit ends too early or
+too late, look at `settled_gain`, and at the scaling of the unknowns in `least_squares`.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,25 +17,28 @@ Coefficients = Float[np.ndarray, " d"]
 Gradient = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n d"]]
 """Residuals, and their Jacobian."""
 
-# Singular values, steps and numbers, relative to the largest of their kind, that are rounding.
-# Smaller: rounding counts as information; larger: information of exact data is lost.
+# Singular values, steps and numbers below this, relative to the largest of their kind, are rounding
+# errors. Smaller: rounding counts as information; larger: information of exact data is lost.
 ROUNDING = 1e-12
-# Leading coefficient of a null vector, relative to its largest one, below which c would overflow:
-# the solution of the linearized problem is not used.
+# If the leading coefficient of a null vector, relative to its largest entry, is below this, c would
+# overflow: the solution of the linearized problem is not used.
 NO_LEADING_COEFFICIENT = 1e-8
-# Expected decrease of the cost, relative to it, at the minimum: coefficients are off by 1e-7 of
-# their standard errors, times the root of the residuals' number. Smaller: steps lost in rounding.
+# A descent ends if the expected relative decrease of the cost is below this. Coefficients then
+# differ from the minimum by 1e-7 standard errors, times the square root of the number of residuals.
+# Smaller: steps are lost in rounding.
 _SETTLED_GAIN = 1e-14
-# Decrease of the cost with which a descent begins again, in units of the new cost. Smaller: a start
-# that is far away decides how close the end is; larger: descents begin again in vain.
+# If a descent has decreased the cost by more than this, in units of the new cost, it begins again
+# with new scales. Smaller: a start that is far away decides how close the end is; larger: descents
+# begin again in vain.
 _MUCH_LOWER = 0.5
-# Options of a rough fit: steps, and the decrease of the cost, in units of the noise, that is not
-# worth one. More, and smaller: steps that follow noise; fewer, and larger: fits that hardly move.
+# Options of a rough fit: its number of steps, and the decrease of the cost, in units of the noise,
+# below which it ends. More steps or a smaller decrease: the fit follows noise. Fewer or larger: the
+# fit hardly moves.
 ROUGH: dict[str, Any] = {"max_steps": 4, "settled_gain": 5.0}
 
 
 def positive(size: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Return sizes by which one may divide: 1 in place of 0."""
+    """Return `size` with 1 in place of 0, as a divisor."""
     return np.where(size > 0, size, 1.0)
 
 
@@ -48,10 +57,10 @@ def least_squares(
 ) -> tuple[Coefficients, bool]:
     """Minimize a sum of squares.
 
-    The unknowns of scipy's trust-region method are combinations of the coefficients that change
-    residuals independently, and equally at the start. The square of their gradient is then the
-    decrease of the cost that a step promises: where it does not matter, no step is tried, and a
-    descent from its minimum takes one evaluation.
+    The unknowns are transformed so that, at the start, the Jacobian has orthonormal columns. The
+    square of the gradient is then the decrease of the cost that a step is expected to make. If this
+    decrease does not matter, no step is tried, so that a descent from a minimum takes one
+    evaluation.
 
     **Arguments:** `linearize(c)` returns the residuals (n,) and their Jacobian (n, d).
     `max_steps`: default 50. `settled_gain`: a decrease of the sum that does not matter.
@@ -119,7 +128,7 @@ class NormalEquations:
     def step(self, damping: float) -> tuple[Float[np.ndarray, " P"], float]:
         """Return a Levenberg-Marquardt step and the decrease of the cost expected from it.
 
-        Without damping the step leaves undetermined combinations as they are.
+        Without damping, undetermined combinations of unknowns do not change.
         """
         values = np.maximum(self._values, 0) + damping
         if not damping:
@@ -128,7 +137,7 @@ class NormalEquations:
         return self._vectors @ part / self._size, float(part @ self._slope)
 
     def spread(self, unit: float = 1.0) -> "Spread":
-        """Return the uncertainty of the solution, for errors of this variance."""
+        """Return the uncertainty of the solution, for errors with the variance `unit`."""
         vectors = self._vectors / self._size[:, None]
         least = ROUNDING * self._values[-1]
         root = vectors * np.sqrt(unit / np.maximum(self._values, least))
@@ -141,8 +150,8 @@ class Spread(NamedTuple):
     root: Float[np.ndarray, "P r"]
     """R with $R R^T = v (J^T J)^+$, without undetermined combinations."""
     hidden: Float[np.ndarray, "P h"]
-    """The same for undetermined combinations, with the smallest eigenvalue above rounding: a lower
-    bound."""
+    """A lower bound of such a root for the undetermined combinations, with the smallest eigenvalue
+    above rounding."""
 
     def variance(
         self, slopes: Inexact[np.ndarray, "P *rest"]
@@ -155,8 +164,8 @@ class Spread(NamedTuple):
         return np.where(hidden > shown, np.inf, shown)
 
     def covariance(self, slopes: Float[np.ndarray, "d P"]) -> Float[np.ndarray, "d d"]:
-        """Return the covariance of numbers with these derivatives; all of it is infinite if one
-        variance is."""
+        """Return the covariance of numbers with these derivatives. If one variance is infinite, all
+        entries are."""
         if np.isinf(self.variance(slopes.T)).any():
             return np.full((len(slopes), len(slopes)), np.inf)
         half = slopes @ self.root

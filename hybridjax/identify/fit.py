@@ -1,4 +1,9 @@
-"""`Fit`: what all fits to data share, whatever they fit."""
+"""`Fit`: the base class of all fits to data.
+
+It has the fields and methods that every fit shares: multipliers, covariance, intervals, findings,
+and how a fit is printed. Subclasses say what their numbers are (`_estimates`), how they are
+summarized (`_summary`, `_page`), and which model can be simulated (`_linear_model`).
+"""
 
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any
@@ -58,7 +63,7 @@ class Fit(WithMultipliers, eqx.Module):
         @property
         def result(self) -> int: ...
 
-        # (What they take depends on what is fitted.)
+        # (The arguments of these two depend on the type of fit.)
         def compare(self, *args: Any, **options: Any) -> Any: ...
         def contains(self, *args: Any, **options: Any) -> Any: ...
 
@@ -69,7 +74,8 @@ class Fit(WithMultipliers, eqx.Module):
 
     @abstractmethod
     def _estimates(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Return the real numbers of which `interval` gives bounds, and their standard errors."""
+        """Return the real numbers for which `interval` gives bounds, and the standard errors of
+        these numbers."""
 
     def _linear_model(self, data: Any) -> Any:
         """Return the `LDTP` that is simulated on data to validate the fit.
@@ -85,7 +91,7 @@ class Fit(WithMultipliers, eqx.Module):
 
     @abstractmethod
     def _summary(self) -> str:
-        """Return what a `repr` says before the findings."""
+        """Return the part of the `repr` before the findings."""
 
     @abstractmethod
     def _page(self) -> tuple[str, ...]:

@@ -1,4 +1,9 @@
-"""All steps from a system to estimated multipliers, in one call."""
+"""`identify_model`: all steps from a system to estimated multipliers, in one call.
+
+It calls public functions one after the other (limit cycle, sections, design, experiments, HTFs,
+fit), and returns their results as a `ModelIdentification`. Only the size of the inputs is computed
+here (`_small_design`). To find a wrong step, call the functions one by one.
+"""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, cast
@@ -38,11 +43,11 @@ from .multipliers import StructuredFit, fit_multipliers
 # Predicted deviations of the outputs, relative to half of their range on the cycle. Larger:
 # distortion biases estimates. Smaller: the accuracy of integration limits them.
 _DEVIATION = 1e-3
-# Points in each step of the orbit, of which the range of the outputs is taken. Fewer: the range is
-# too small. More: time.
+# Number of points in each step of the orbit, from which the range of the outputs is taken. Fewer:
+# the range is too small. More: time.
 _PER_STEP = 8
-# Periods of the design, and its versions with other random phases. More: time. Fewer: few lines,
-# and variances that are uncertain.
+# Number of periods of the design, and number of its versions with other random phases. More: time.
+# Fewer: H is known at few lines, and its variances are uncertain.
 _PERIODS = 16
 _REALIZATIONS = 4
 
@@ -156,7 +161,8 @@ def _small_design(
     plain = multisine(N, _PERIODS, lines="odd", seed=seed, inputs=model.inputs)
     lines = np.unique(plain.line / plain.periods)
     H = np.asarray(model.htf(lines).H)
-    # (The response to inputs of rms 1: of all harmonics together, on average over the lines.)
+    # (Power of the response to inputs of rms 1: the sum over all harmonics, averaged over the
+    # lines.)
     power = (np.abs(H) ** 2).sum(axis=(0, 3))
     gain = np.sqrt(power.mean(axis=0))
     orbit = cycle.trajectory()

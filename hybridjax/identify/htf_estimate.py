@@ -1,6 +1,9 @@
-"""Harmonic transfer functions from measured inputs and outputs (Sec. V).
+"""`estimate_htf`: harmonic transfer functions from measured inputs and outputs (Sec. V).
 
-The normal equations, with the weight of each experiment, are summed in `spectral_sums.py`.
+It gets sums over all experiments from `spectral_sums.py`, one for each *line* k (the frequency k /
+P), solves each line (`_solve_lines`), and returns an `HTF` with variances. With `references`,
+`instrument.py` takes the place of both. A wrong H has its cause in `_solve_lines` or in the sums; a
+wrong variance, in `variance` within `_solve_lines`.
 """
 
 from typing import Literal, NamedTuple
@@ -19,8 +22,9 @@ from .instrument import htf_by_reference
 from .spectral_sums import SILENT_LINE, Experiments, SpectralSums, spectral_sums
 
 
-# Realizations of a line up to which the shape of their scatter is estimated. Fewer: regions for
-# errors of constant size are too small; the mean of more is normally distributed.
+# Up to this number of realizations of a line, the shape of their scatter is estimated (see
+# `roundness`). Smaller: if all errors have the same modulus, confidence regions are too small.
+# Larger: needless, since the mean of many realizations is normally distributed.
 _FEW_REALIZATIONS = 16
 
 
@@ -155,18 +159,20 @@ class _LineEstimates(NamedTuple):
 
     H: Complex[np.ndarray, "M F ny nu"]
     realizations: Int[np.ndarray, " F"]
-    """Experiments beyond those that the unknowns need: degrees of freedom of the residual."""
+    """Number of experiments less the number of unknowns: complex degrees of freedom of the
+    residual."""
     total: Float[np.ndarray, "M F ny nu"]
-    """Variance from the residual; from the mean residual of all lines where there is one
-    realization."""
+    """Variance from the residual of a line; with one realization, from the mean residual of all
+    lines."""
     noise: Float[np.ndarray, "M F ny nu"] | None
     """Variance from repeated windows; None where there was one window."""
     power: Float[np.ndarray, "F nu"]
-    """Variance of white noise in the outputs relative to that of the estimates."""
+    """Variance of white noise in the outputs, divided by the variance that it causes in H."""
 
 
 def _solve_lines(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> _LineEstimates:
-    r"""Solve `Y = H U + G conj(U)`, with G = 0 unless the line coincides with its mirror image.
+    r"""Solve `Y = H U + G conj(U)`, with G = 0 unless the line coincides with its mirror image (f
+    is a multiple of 1/2).
 
     With p unknowns and R experiments the residuals have R - p complex degrees of freedom, and the
     variance of H is their mean square times the diagonal of the inverse of the normal matrix. The
@@ -218,9 +224,10 @@ def _roundness(
 ) -> Float[np.ndarray, "M F ny nu"] | None:
     r"""Return `VarianceDof.roundness` of the residuals of realizations.
 
-    None where inputs share experiments, lines are mirrored, or realizations are many. With the
-    residuals $d_j = (Y_j - H U_j) \overline{U_j} / |U_j|$ of each input, $\sum_j |d_j|^2$ is the
-    energy of Y less $|H|^2$ times the power of U, and $\sum_j d_j^2$ follows in the same way.
+    None if inputs share experiments, if lines coincide with their mirror images, or if there are
+    many realizations. With the residuals $d_j = (Y_j - H U_j) \overline{U_j} / |U_j|$ of each
+    input, $\sum_j |d_j|^2$ is the energy of Y less $|H|^2$ times the power of U, and $\sum_j d_j^2$
+    follows in the same way.
     """
     nu = len(sums.setup.inputs)
     gram = sums.gram[rows, :nu, :nu]
@@ -243,8 +250,9 @@ def roundness(
 ) -> Float[np.ndarray, "*shape"]:
     r"""Return $1 - |\sum_j d_j^2|^2 / (\sum_j |d_j|^2)^2$ relative to its mean for Gaussian errors.
 
-    Of n errors the mean is $(n - 2) / n$: it is Mauchly's criterion of their covariance in the
-    plane, squared (Annals of Mathematical Statistics 1940). 1 for two errors or fewer, or none.
+    The mean for n Gaussian errors is $(n - 2) / n$. (This is the square of Mauchly's criterion for
+    their covariance in the plane, Annals of Mathematical Statistics 1940.) For two errors or fewer,
+    the result is 1.
 
     **Arguments:** `square`: $\sum_j |d_j|^2$. `turned`: $\sum_j d_j^2$. `count`: n.
     """
@@ -257,7 +265,8 @@ def roundness(
 
 
 def _why_not_total(sums: SpectralSums, rows: Int[np.ndarray, " F"]) -> str:
-    """Return the reason why the scatter over experiments is not that over random phases, if any."""
+    """Return the reason why the scatter over experiments does not show the effect of random phases;
+    empty if it does."""
     nu = len(sums.setup.inputs)
     gram = sums.gram[rows]
     power = np.linalg.trace(gram[:, :nu, :nu])

@@ -1,18 +1,21 @@
-r"""HTFs of a plant that is in a loop: an external reference is the instrument.
+r"""HTFs of a plant in a control loop: an external reference is the instrument.
 
-With a controller at work, $u = r - F y$, noise v of the output goes round the loop into u, and
-the ratio of y to u is that of a mixture of plant and controller. The reference r is independent of
-v. In each class of lines f + integers let R, U and Y be the spectra of M experiments, one column
-for each experiment. Then
+With a controller at work, $u = r - F y$, noise v of the output goes round the loop into u, and the
+ratio of y to u is a mixture of plant and controller. The reference r is independent of v. In each
+class of lines f + integers let R, U and Y be the spectra of M experiments, one column for each
+experiment. Then
 
 $$P = (Y \hat U^*) (U \hat U^*)^{-1}, \qquad \hat U = (U R^*) (R R^*)^{-1} R,$$
 
-which is $T_{yr} T_{ur}^{-1}$ for as many references as inputs. With $E = Y - P U$, which holds no
-part of R, the error of P is $E \hat U^* (U \hat U^*)^{-1}$: the variance of its entry (a, b) is
-that of row a of E times the entry (b, b) of $(\hat U \hat U^*)^{-1}$ (Pintelon and Schoukens 2012,
-sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983). With the estimated P, the
-expectation of $E E^*$ is this variance times
-$M - 2 n + \mathrm{tr}\, (\hat U \hat U^*)^{-1} U U^*$, n the number of rows of U.
+which is $T_{yr} T_{ur}^{-1}$ if there are as many references as inputs. The residual $E = Y - P U$
+is independent of R, and the error of P is $E \hat U^* (U \hat U^*)^{-1}$. So the variance of the
+entry (a, b) of P is the variance of row a of E times the entry (b, b) of $(\hat U \hat U^*)^{-1}$
+(Pintelon and Schoukens 2012, sections 2.6 and 7.2.7, for matrices; Söderström and Stoica 1983).
+With the estimated P, the expectation of $E E^*$ is the variance times $M - 2 n + \mathrm{tr}\,
+(\hat U \hat U^*)^{-1} U U^*$, where n is the number of rows of U.
+
+`estimate_htf` and `estimate_loop` call this file: `spectral_products` sums the products of spectra
+over experiments, and `solve` computes P and its variances (`_solve_classes`).
 """
 
 import dataclasses
@@ -34,14 +37,15 @@ from .descent import positive
 from .spectral_sums import SILENT_LINE, Experiments, Setup, parts_of
 
 
-# Smallest singular value of the inputs' answer to the references, relative to the largest, with
-# which the plant is told apart. Smaller: noise is divided by noise. Larger: plants are refused
-# behind controllers of high gain.
+# The plant can be identified if the smallest singular value of the response of the inputs to the
+# references, relative to the largest, exceeds this. Smaller: noise is divided by noise. Larger:
+# plants behind controllers of high gain are refused.
 _ANSWERS = 1e-4
 
 
 class Roles(NamedTuple):
-    """What each input of the data is to the plant: columns of its own inputs, of references."""
+    """The role of each input of the data: columns that are inputs of the plant, and columns that
+    are references."""
 
     inputs: list[int]
     references: list[int]
@@ -50,8 +54,8 @@ class Roles(NamedTuple):
     def of(
         cls, names: Sequence[str], reference: Sequence[str], fewest: int | None = None
     ) -> "Roles":
-        """**Raises:** `DefinitionError` unless references are some, not all, of the inputs, and
-        `fewest` or more. Default: as many as the others."""
+        """**Raises:** `DefinitionError` unless the references are some, but not all, of the inputs,
+        and at least `fewest`. Default: as many as the other inputs."""
         require_among("input", reference, names, "`references`: ")
         references = [list(names).index(name) for name in reference]
         inputs = [i for i in range(len(names)) if i not in references]
@@ -96,7 +100,8 @@ def in_loop(
 def require_loop(
     roles: Roles, signals: Sequence[np.ndarray], names: Sequence[str]
 ) -> None:
-    """**Raises:** `DefinitionError` for an input that is its reference: there is no loop then."""
+    """**Raises:** `DefinitionError` for an input that equals its reference, so that there is no
+    loop."""
     for i, k in itertools.product(roles.inputs, roles.references):
         if all(np.array_equal(x[..., i], x[..., k]) for x in signals):
             raise DefinitionError(
@@ -110,11 +115,12 @@ class Sums(NamedTuple):
     total: Complex[np.ndarray, "K n n"]
     """Sums of z z*, of the means over windows."""
     between: Complex[np.ndarray, "K n n"]
-    """Sums of the covariances of these means between windows."""
+    """Sums of the covariances of these means, from the differences between windows."""
     experiments: int
     setup: Setup
     unit: Float[np.ndarray, " signals"]
-    """Sizes of the signals, in which they are measured: each has a unit of its own."""
+    """Magnitudes of the signals. All sums are in these units, since each signal has its own
+    unit."""
 
     def rows(self, names: Sequence[str]) -> Int[np.ndarray, " a"]:
         """Return the rows of signals, for all components."""
@@ -174,7 +180,7 @@ def htf_by_reference(
     """Return the HTFs of the plant, with all harmonics; see `estimate_htf`.
 
     **Raises:** `DefinitionError` as `Roles.of`, and if the references excite no whole class of
-    lines, or the inputs do not answer them.
+    lines, or the inputs do not respond to them.
     """
     total = None
     for part in parts_of(data):
@@ -230,7 +236,8 @@ def solve(
 ) -> HTF:
     """Return the HTFs from the inputs to the outputs in the classes that the references excite.
 
-    **Raises:** `DefinitionError` if there are none, or the inputs do not answer the references.
+    **Raises:** `DefinitionError` if there are no such classes, or if the inputs do not respond to
+    the references.
     """
     N = sums.setup.n_sections
     P = sums.setup.periods
@@ -273,9 +280,10 @@ class _ClassEstimates(NamedTuple):
 
     H: Complex[np.ndarray, "K y u"]
     variance: Float[np.ndarray, "K y u"] | None
-    """From the scatter of experiments, or else that of windows."""
+    """Variance from the scatter of experiments, or if there is none, from the scatter of
+    windows."""
     noise: Float[np.ndarray, "K y u"] | None
-    """From windows, if both are known."""
+    """Variance from windows, if both are known."""
     dof: Float[np.ndarray, " K"]
     """Complex degrees of freedom of the variance."""
 
@@ -309,7 +317,8 @@ def _solve_classes(
     by_input = _diagonal(spread)
 
     def variance(G, rows):
-        """Return the variances of H for errors Y - H U with these products, of so many rows."""
+        """Return the variances of H for errors Y - H U, from their products G, for a number of
+        rows."""
         adjoint = _adjoint(H)
         cross = block(y, u, G) @ adjoint
         square = block(y, y, G) - cross - _adjoint(cross)
@@ -335,9 +344,11 @@ def _solve_classes(
             noise=None,
             dof=dof,
         )
-    # The error of P multiplies all of U in E, of which the references explain only a part. The
-    # other part adds errors of entries of P to E: of one at the edge of its disc, where they
-    # count three times, and of all others, whose scatter takes degrees of freedom.
+    # E contains the error of P times U, and `dof` accounts only for the part of U that the
+    # references explain. `left` is the other part, relative to this one: it enlarges E E*, on
+    # average by its trace times the variance. The error of the entry itself is assumed at the edge
+    # of its 95 % confidence disc, where its square is three times the variance. The scatter of all
+    # other entries reduces the degrees of freedom.
     left = spread @ block(u, u) - np.eye(len(u))
     edge = _diagonal(left @ spread) / by_input
     counted = dof + _diagonal(left).sum(axis=1)
@@ -359,7 +370,7 @@ def _require_answers(
 ) -> None:
     """**Raises:** `DefinitionError` if the references do not move each input.
 
-    **Arguments:** `power`: of the inputs' answers. `reference`: of the references.
+    **Arguments:** `power`: power of the inputs' responses. `reference`: power of the references.
     """
     size = np.linalg.svd(power, compute_uv=False)
     drive = np.linalg.svd(reference, compute_uv=False)[:, 0]

@@ -1,4 +1,10 @@
-"""Plant, controller, loop and sensitivity from experiments with a loop at work."""
+"""`estimate_loop`: plant, controller, closed loop and sensitivity from experiments in a control
+loop.
+
+Each of these is an HTF from one set of signals to another, with an external reference as the
+instrument; it is estimated by `instrument.solve` from the same sums. `Loop.missing` says which of
+them the data do not give.
+"""
 
 from collections.abc import Sequence
 
@@ -148,9 +154,10 @@ def _require_references(what: str, given: Names, needed: Names) -> None:
 
 
 def _without(sums: Sums, rows: np.ndarray) -> Sums:
-    """Return products of the residuals of all signals, after regression on those in these rows.
+    """Return the products of spectra after regression of all signals on the signals in `rows`
+    (products of the residuals).
 
-    Each row takes one degree of freedom.
+    Each of these rows takes one degree of freedom.
     """
     total = sums.total
     power = total[:, rows[:, None], rows]

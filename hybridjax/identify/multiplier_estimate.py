@@ -1,4 +1,12 @@
-"""Estimated Floquet multipliers: their confidence regions, and comparison with true ones."""
+"""`MultiplierFit`: estimated Floquet multipliers with confidence regions, and their comparison with
+true ones.
+
+All fits of multipliers are subclasses. They give the coefficients of the polynomial whose roots are
+the multipliers, and the covariance of these coefficients; standard errors, confidence regions
+(`contains`, `ellipse`) and tests follow from these here. If regions are wrong, first test the
+covariance of the coefficients: it comes from the subclass. The last functions of the file make
+findings about the number of multipliers (`order_doubts`, `left_out`).
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -19,14 +27,15 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import folded, p_value, rounded, standard_error
 from ..errors import DefinitionError
+from ..linear.multipliers import largest_first
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients, positive
 from .fit import Fit
 
 
-# Level of the test whether a fit needs one more multiplier. Larger: process noise, whose errors are
-# estimated from few blocks, makes fits of the right order doubtful. Smaller: weak multipliers that
-# move the others pass.
+# Level of the test whether a fit needs one more multiplier. Larger: with process noise, whose
+# errors are estimated from few blocks, fits of the right order get a finding. Smaller: missing weak
+# multipliers that bias the others pass.
 _NEEDED = 1e-4
 
 
@@ -43,7 +52,7 @@ class HasMultipliers(Protocol):
 
 
 Truth = Multipliers | HasMultipliers
-"""Multipliers, or what has them."""
+"""Multipliers, or an object that has them."""
 
 
 def multipliers_from(truth: Any) -> Complex[np.ndarray, " k"]:
@@ -55,16 +64,17 @@ def multipliers_from(truth: Any) -> Complex[np.ndarray, " k"]:
 RoughFit = tuple[Coefficients, Callable[[], Covariance]]
 """Coefficients, and a function for their covariance."""
 
-# Eigenvalues of a correlation matrix below this part of the largest one are zero: equations of
-# multipliers that coincide are one. Larger: correlated equations count as one. Smaller: rounding is
-# divided by.
+# Eigenvalues of a correlation matrix below this part of the largest one are zero, so that the
+# equations of two equal multipliers count as one. Larger: correlated equations count as one.
+# Smaller: division by rounding errors.
 _RANK = 1e-12
 # Points of the border of a confidence region. Fewer: corners show; more: figures grow.
 _BORDER_POINTS = 100
 
 
 class MultiplierComparison(Showable, eqx.Module):
-    """Estimated Floquet multipliers, each paired with a true one, or with one of another fit.
+    """Estimated Floquet multipliers, each paired with a true multiplier or with a multiplier of
+    another fit.
 
     The pairing has the smallest sum of distances; if the numbers of multipliers differ, the
     unpaired ones are not listed. Printing it shows a table.
@@ -128,7 +138,7 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     rows, columns = linear_sum_assignment(distances)
     paired_values = values[rows]
     paired_truth = truth[columns]
-    order = np.lexsort((-np.imag(paired_truth), -np.abs(paired_truth)))
+    order = largest_first(paired_truth)
     # (Cycles and models have multipliers without errors.)
     with_fit = hasattr(true, "standard_errors")
     return MultiplierComparison(
@@ -144,9 +154,9 @@ class MultiplierFit(Fit):
     - `multipliers` (d,): by decreasing modulus, the roots of
       $p(\lambda) = \lambda^d + c_1 \lambda^{d-1} + \ldots + c_d$.
     - `coefficients` (d,): c_1 to c_d, real.
-    - `covariance` (d, d): that of the coefficients, infinite where it is unknown, estimated with
-      `covariance_dof` degrees of freedom (infinite where it is exact). All standard errors and
-      confidence regions follow from it.
+    - `covariance` (d, d): covariance of the coefficients, infinite where it is unknown. It is
+      estimated with `covariance_dof` degrees of freedom (infinite: the covariance is exact). All
+      standard errors and confidence regions follow from it.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -172,7 +182,7 @@ class MultiplierFit(Fit):
         powers = self.multipliers[:, None] ** exponents
         slope = np.polyval(np.polyder([1.0, *self.coefficients]), self.multipliers)
         is_real = np.imag(self.multipliers) == 0
-        # The slope is zero where two multipliers coincide.
+        # (p' is zero where two multipliers coincide.)
         with np.errstate(all="ignore"):
             gradient = -powers / slope[:, None]
             imaginary = np.where(is_real[:, None], 0.0, gradient.imag)
@@ -181,7 +191,8 @@ class MultiplierFit(Fit):
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
-        """Root of the expected squared distance of each multiplier from the true one."""
+        """Standard error of each multiplier: the square root of the expected squared distance from
+        the true multiplier."""
         return np.sqrt(np.linalg.trace(self.multiplier_covariances))
 
     def _estimates(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
@@ -223,7 +234,7 @@ class MultiplierFit(Fit):
         missed = equations @ [1.0, *self.coefficients]
         slopes = equations[:, 1:]
         covariance = slopes @ self.covariance @ slopes.T
-        # Scaled, since a tiny multiplier makes one of the two equations tiny.
+        # (Scaled, since of the two equations of a tiny multiplier one is tiny.)
         scale = np.sqrt(np.diag(covariance))
         if not (scale > 0).all():
             return (np.inf if missed.any() else 0.0), len(missed)
@@ -305,7 +316,7 @@ class MultiplierFit(Fit):
         """Return the p value of the hypothesis that all of these are multipliers."""
         if not np.isfinite(self.covariance).all():
             return None
-        # (Of a conjugate pair one is enough.)
+        # (One of a conjugate pair is enough.)
         is_upper = np.imag(true) >= 0
         is_alone = ~np.isin(np.conj(true), true)
         distinct = true[is_upper | is_alone]
@@ -357,7 +368,7 @@ class MultiplierFit(Fit):
         return ""
 
     def _shown_moduli(self) -> str:
-        """Return the moduli and their intervals, of a pair of complex multipliers once."""
+        """Return the moduli and their intervals, listing a pair of complex multipliers once."""
         if self.result != Result.OK:
             return ""
         shown = []
@@ -369,7 +380,7 @@ class MultiplierFit(Fit):
             if not np.isfinite(bounds).all():
                 shown.append(f"{modulus:.4f}")
                 continue
-            # (As many digits as the interval leaves.)
+            # (With as many digits as the width of the interval justifies.)
             width = max(bounds[1] - bounds[0], 1e-12)
             decimals = -np.log10(width / 2)
             digits = max(2, int(np.ceil(decimals)))
@@ -437,9 +448,10 @@ def contradicted_by(
 ) -> int | None:
     """Return the order of the first of other fits that contradicts a fit; None if none does.
 
-    It does if a multiplier is outside of its confidence regions, and its nearest one outside of
-    those of the fit. (Of 95 %: at 99 % half as many right orders are doubted, and a few more that
-    are too low pass. Drift moves multipliers further: regions of 99.9 % notice it.)
+    Another fit contradicts if a multiplier of the fit lies outside of the confidence regions of the
+    other fit, and the nearest multiplier of the other fit outside of those of the fit. (Regions of
+    95 %: with 99 %, half as many fits of the right order get a finding, and a few more fits of too
+    low order pass. Drift moves multipliers further: regions of 99.9 % notice it.)
 
     **Arguments:** `others`: the fits; a `DefinitionError` means too few data.
     """
@@ -476,17 +488,17 @@ def order_doubts(
     order = contradicted_by(fit, higher)
     if order is None:
         return []
-    # (No numbers: those of a few iterations may be far from those of a fit.)
+    # (Without numbers: after a few iterations, they may be far from those of a complete fit.)
     text = f"`order` may be too low: order {order} gives other multipliers; compare both fits."
     return [Finding("order", text)]
 
 
 def left_out(higher: Callable[[], RoughFit]) -> list[Finding]:
-    """Return a finding if a fit of one more multiplier, begun at a fit, needs it.
+    """Return a finding if a fit needs one more multiplier. `higher`: a fit with one more multiplier
+    that starts from it.
 
-    Without more numerators, the fit is the one with a zero last coefficient of the denominator: a
-    coefficient that differs from zero (Wald's test) belongs to a multiplier that the fit left out.
-    If there is none, nothing moves the coefficient from zero.
+    With the same numerators, the present fit is the higher fit with a last coefficient of zero. If
+    this coefficient differs from zero (Wald's test), the present fit has left out a multiplier.
     """
     with suppress(DefinitionError):
         coefficients, covariance = higher()

@@ -1,8 +1,10 @@
 """Floquet multipliers from the exact structure of harmonic transfer functions, and their number.
 
-`fit_multipliers` leaves the minimum to `variable_projection.py`, and the weights to `weights.py`.
-The second half of this file decides on the number of multipliers, by what noise alone explains
-(`noise_ratios`, `supported`), and by description lengths (`compare_orders`).
+`fit_multipliers` takes weights from `weights.py`, and the minimum from `variable_projection.py`.
+The second half of this file decides on the number of multipliers: `noise_ratios` and `supported`
+ask which multipliers could be noise alone, and `compare_orders` (for `hj.select_order`) also
+compares description lengths. A wrong multiplier has its cause in `variable_projection.py`, a wrong
+number of multipliers in `supported`.
 """
 
 import dataclasses
@@ -36,8 +38,9 @@ from .multiplier_estimate import (
 )
 
 
-# Fits of HTFs without variances whose weights come from the last misfit. Fewer: weights of the
-# wrong shape; more: multipliers move by a tenth of their standard errors at most.
+# HTFs without variances are fitted again this many times, with weights from the last residuals.
+# Fewer: weights have the wrong shape. More: multipliers change by at most a tenth of their standard
+# errors.
 _REWEIGHTINGS = 2
 
 
@@ -200,7 +203,8 @@ def fit_multipliers(
     )
 
     def of_order(order: int) -> RoughFit:
-        # No larger numerators, if possible: without zero multipliers they are large enough.
+        # With numerators of the same size, if possible. (They are large enough if there are no zero
+        # multipliers.)
         fewer = max(solution.size - 1 - order * htf.n_sections, 0)
         size = varpro.numerator_size(htf, order, fewer)
         groups = varpro.group_htf(htf, solution.weight, size)
@@ -224,7 +228,7 @@ def fit_multipliers(
 
 
 class _Solution(NamedTuple):
-    """The solution of a fit with so many multipliers."""
+    """The solution of a fit with a given number of multipliers."""
 
     groups: list[varpro.HTFGroup]
     weight: Float[np.ndarray, "M F ny nu"]
@@ -237,7 +241,8 @@ class _Solution(NamedTuple):
 def _solve(
     htf: HTF, rms: Float[np.ndarray, " ny"], order: int, extra_lags: int | None
 ) -> _Solution:
-    """Return the solution weighted by variances, or else by those that its residuals suggest."""
+    """Return the solution weighted by the variances of the HTFs; if there are none, by variances
+    estimated from its residuals."""
     size = varpro.numerator_size(htf, order, extra_lags)
     weight = weights.error_weights(htf, rms)
     groups = varpro.group_htf(htf, weight, size)
@@ -259,11 +264,11 @@ def _solve(
     )
 
 
-# Largest ratio of squares of rounding errors. Smaller: they count as multipliers of exact HTFs;
-# larger: weak multipliers of clean HTFs are missed.
+# Squares of rounding errors differ from each other by at most this factor. Smaller: in exact HTFs,
+# rounding errors count as multipliers. Larger: weak multipliers of HTFs without noise are missed.
 _ROUNDING_VARIES = 1e6
-# Probability that noise alone is taken for a multiplier, and the random matrices from which its
-# quantile is taken. Smaller: weak multipliers are missed; larger: orders are too high.
+# Probability that noise alone is taken for a multiplier; and the number of random matrices from
+# which the quantile is computed. Smaller: weak multipliers are missed. Larger: orders are too high.
 _FALSE_ALARMS = 0.01
 _DRAWS = 20000
 
@@ -403,8 +408,8 @@ def _largest_of_noise(size: int) -> float:
 
 
 NoiseRatios = tuple[Float[np.ndarray, " d1"], float]
-"""Of a fit of order d: d + 1 ratios, ascending, one of which is noise, that of chi itself; and the
-standard deviation of each where it is noise."""
+"""For a fit of order d: d + 1 ratios, ascending, of which the smallest is always noise (that of chi
+itself); and the standard deviation of a ratio that is noise."""
 
 
 def noise_ratios(
@@ -413,7 +418,8 @@ def noise_ratios(
     """Return squared singular values of the residuals of numerators of $z^{-jN} H$, j = 0..d, in
     units of the noise, for a fit to HTFs.
 
-    **Arguments:** `exact`: whether the noise is rounding, which differs by orders of magnitude.
+    **Arguments:** `exact`: whether the noise is rounding errors, which differ by orders of
+    magnitude.
     """
     cost, dof = varpro.cost_of(groups, c)
     level, tails = weights.estimated_noise(weights.largest_misfit(htf), cost / dof)
@@ -426,12 +432,12 @@ def noise_ratios(
 
 
 def supported(ratios: Callable[[int], NoiseRatios], order: int) -> tuple[int, float]:
-    """Return how many multipliers of a fit noise alone does not account for, and the strength of
-    the weakest that it may account for, relative to the noise.
+    """Return the number of multipliers that cannot be noise alone; and the strength, relative to
+    the noise, of the weakest one that may be noise.
 
-    A fit of the returned number supports all of its multipliers, too.
+    In a fit with the returned number of multipliers, none may be noise alone, either.
 
-    **Arguments:** `ratios(k)`: those of a fit of order k.
+    **Arguments:** `ratios(k)`: the noise ratios of a fit of order k.
     """
     most = order
     weakest = 0.0
@@ -450,7 +456,7 @@ def supported(ratios: Callable[[int], NoiseRatios], order: int) -> tuple[int, fl
 def unsupported(
     ratios: Callable[[int], NoiseRatios], order: int, refused: bool = False
 ) -> list[Finding]:
-    """Return a finding if noise alone may account for multipliers of a fit.
+    """Return a finding if multipliers of a fit may be noise alone.
 
     **Arguments:** as of `supported`. `refused`: whether such a fit is refused.
     """

@@ -1,13 +1,18 @@
-r"""Periodic models on the host: matrices without padding, in local coordinates.
+r"""Periodic models on the host for fits: matrices without padding (`PeriodicModel`), and the local
+coordinates in which they are changed (`LocalCoordinates`).
 
-Predictions are linear in $B - K D$, K and D, given $F = A - K C$ and C. The coordinates of each
-x[n] are free. They are fixed by the output-normal form
+The coordinates of the state x[n] are free at every section. They are fixed by the output-normal
+form
 
-$$\rho^2 F[n]^T F[n] + C[n]^T C[n] = I,$$
+$$\rho^2 F[n]^T F[n] + C[n]^T C[n] = I, \qquad F = A - K C.$$
 
-in which only those changes of F[n] and C[n] are made whose columns are orthogonal to the columns of
-$[\rho F[n]; C[n]]$; no change of the coordinates of states is among these to first order (McKelvey,
+Only those changes of F[n] and C[n] are made whose columns are orthogonal to the columns of $[\rho
+F[n]; C[n]]$. To first order, none of these is a change of the coordinates of states (McKelvey,
 Helmersson and Ribarits 2004; Ribarits, Deistler and Hanzon 2005; for each section of the period).
+Given F and C, predictions are linear in $B - K D$, K and D, which are the other coordinates.
+
+`fit_ldtp`, bounds and designs call `local_coordinates(model)`, and `moved(step)` for the next
+model.
 """
 
 from collections.abc import Callable
@@ -25,8 +30,8 @@ from .descent import ROUNDING, NormalEquations
 Blocks = list[Float[np.ndarray, "rows columns"]]
 """One matrix for each section."""
 
-# Largest modulus of a multiplier of rho F. At 1 the form does not exist; near 0 the coordinates
-# weight the first period only.
+# Largest modulus of a multiplier of rho F, which determines rho. At 1 the normal form does not
+# exist; near 0 the coordinates weight the first period only.
 _LARGEST_MODULUS = 0.5
 
 
@@ -72,7 +77,7 @@ class PeriodicModel(NamedTuple):
         return LDTP.from_blocks(*self.times(scale)[:4], inputs, outputs)
 
     def times(self, scale: Float[np.ndarray, " ny"]) -> "PeriodicModel":
-        """Return the model with outputs and errors that are larger by these factors."""
+        """Return the model with outputs and errors multiplied by `scale`."""
         unit = scale[:, None]
         return self._replace(
             C=[unit * C for C in self.C],
@@ -97,7 +102,7 @@ class PeriodicModel(NamedTuple):
 
     @property
     def F(self) -> Blocks:
-        """A - K C, of the errors of predictions."""
+        """A - K C, the matrices by which errors of predictions decay."""
         return [A - K @ C for A, K, C in zip(self.A, self.gain, self.C, strict=True)]
 
     def monodromy(self, first: int = 0) -> Float[np.ndarray, "d d"]:
@@ -112,7 +117,7 @@ class PeriodicModel(NamedTuple):
 
     @property
     def of_errors(self) -> "PeriodicModel":
-        """The model whose states are the errors of predictions, A - K C in place of A."""
+        """The model with A - K C in place of A: its states are the errors of predicted states."""
         return self._replace(A=self.F)
 
     def refined(
@@ -139,7 +144,7 @@ class LocalCoordinates(NamedTuple):
     """Directions in which a model can change: Y in F and C, and the entries of B - K D, K and D."""
 
     model: PeriodicModel
-    """In output-normal form."""
+    """The model, in output-normal form."""
     to_A: list[Float[np.ndarray, "after q"]]
     """A changes by `to_A @ Y` with Y (q, d), F by `to_A - K to_C` times Y."""
     to_C: list[Float[np.ndarray, "ny q"]]
@@ -162,7 +167,7 @@ class LocalCoordinates(NamedTuple):
 
     @property
     def places(self) -> list[dict[str, slice]]:
-        """The entries of each block in a vector of coordinates, for each section."""
+        """For each section, the slice of each block in a vector of coordinates."""
         out = []
         first = 0
         for n in range(self.model.n_sections):
@@ -181,7 +186,8 @@ class LocalCoordinates(NamedTuple):
     def moved(self, step: Float[np.ndarray, " P"]) -> PeriodicModel:
         """Return the model with these coordinates; those of `model` are zero.
 
-        A and B follow from F and B - K D, so that steps go straight where A and K C nearly cancel.
+        A and B are computed from F and B - K D. (Steps in A and K themselves would have to follow a
+        curve where A and K C nearly cancel.)
         """
         places = self.places
         moved: list[tuple] = []
@@ -254,7 +260,8 @@ def _gramians(model: PeriodicModel, rho: float) -> Blocks:
     d = model.dims[0]
     P = around(np.zeros((d, d)))[0]
     phi = rho**model.n_sections * model.monodromy()
-    # Periods are doubled until the remainder, 0.5^(2^6), is rounding.
+    # The number of periods is doubled six times, until the remainder, 0.5^(2^6), is a rounding
+    # error.
     for _ in range(6):
         P = P + phi.T @ P @ phi
         phi = phi @ phi

@@ -1,4 +1,10 @@
-"""The paper's parametric fit: a rational function of z for H_0 (Sec. VI-C3)."""
+"""`fit_rational`: the paper's own fit, a rational function of z for H_0 of each output (Sec.
+VI-C3).
+
+Poles to the power N are compared with the Floquet multipliers. The fit is biased, since the true
+H_0 has more poles; `fit_multipliers` has no such bias. `_fit_one` descends from several starts
+(`_starts`), and takes the lowest minimum.
+"""
 
 import functools
 from collections.abc import Iterator
@@ -18,6 +24,7 @@ from .._core.showable import WithMultipliers
 from .._core.text import how_many, number
 from ..errors import ComputationError, DefinitionError
 from ..linear.htf import HTF
+from ..linear.multipliers import largest_first
 from .descent import least_squares
 from .multiplier_estimate import MultiplierComparison, Truth, compare_multipliers
 from .variable_projection import (
@@ -33,9 +40,9 @@ from .variable_projection import (
 # Iterations of Sanathanan and Koerner from which descents start. Fewer: other minima are found;
 # more: the same result in longer time.
 _STARTS = (0, 1, 4, 29)
-# Part of the residual, relative to H, that a step may still explain at the end, and by which equal
-# costs differ (a converged fit is then preferred). Smaller: descents on exact data stall in
-# rounding; larger: coefficients that are off by as much.
+# A descent ends if a step changes the residual, relative to H, by less than this. Costs that differ
+# by less are equal (a converged fit is then preferred). Smaller: descents on exact data stall in
+# rounding. Larger: coefficients have relative errors of this size.
 _ACCURACY = 1e-8
 
 
@@ -86,8 +93,8 @@ class RationalFit(WithMultipliers, eqx.Module):
     def compare(
         self, other: Truth, output: str | int | None = None
     ) -> MultiplierComparison:
-        """Pair the multipliers of each output's fit (or of one output alone) with the true ones.
-        There is no test: the errors of this fit are not known.
+        """Pair the multipliers of each output (or of one output) with the true multipliers. There
+        is no test: the errors of this fit are not known.
 
         **Raises:** `DefinitionError` for an output that is not there.
 
@@ -196,7 +203,7 @@ def fit_rational(
     ]
     numerator, denominator, residual, result = map(np.array, zip(*fits, strict=True))
     roots = np.stack([_roots(a) for a in denominator])
-    # A useless pole far outside overflows.
+    # A pole far outside of the unit circle overflows.
     with np.errstate(over="ignore", invalid="ignore"):
         multipliers = roots**htf.n_sections
     return RationalFit(
@@ -242,9 +249,9 @@ def _fit_one(
     rms = float(np.sqrt(power))
     if rms == 0:
         raise DefinitionError(f"{name} is zero: leave this output out.")
-    exponents = 1 + np.arange(zeros + 1)
-    angles = -2j * np.pi * f[:, None] * exponents
-    powers = np.exp(angles)
+    delays = 1 + np.arange(zeros + 1)
+    exponent = -2j * np.pi * f[:, None] * delays
+    powers = np.exp(exponent)
     response = FittedResponse(
         harmonic=(0, -1),
         share=1.0,
@@ -280,16 +287,16 @@ def _fit_one(
 
 
 def _roots(coefficients: Float[np.ndarray, " c"]) -> Complex[np.ndarray, " n"]:
-    """Return the roots by decreasing modulus; NaN for each that lies at infinity."""
+    """Return the roots by decreasing modulus; NaN for each root at infinity."""
     finite = np.roots(coefficients).astype(complex)
-    order = np.lexsort((-np.imag(finite), -np.abs(finite)))
-    finite = finite[order]
+    finite = finite[largest_first(finite)]
     infinite = len(coefficients) - 1 - len(finite)
     return np.concatenate([np.full(infinite, np.nan), finite])
 
 
 def _starts(group: HTFGroup, poles: int) -> Iterator[Float[np.ndarray, " p"]]:
-    """Iterate as Sanathanan and Koerner: the last denominator weighs the next problem."""
+    """Iterate over starts, by Sanathanan and Koerner's method: the next problem is weighted by the
+    last denominator."""
     a = np.zeros(poles)
     for step in range(1 + max(_STARTS)):
         columns, _ = late_columns(group, a)

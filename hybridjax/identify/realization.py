@@ -1,10 +1,13 @@
 r"""State-space models from impulse responses, and the steps that all realizations share.
 
 The state at a section represents the effect of earlier inputs on the outputs from there on. Its
-dimension is a rank at each section: that of the Hankel matrix whose block `[i, j]` is the response
-at section n + i to an input at section n - 1 - j (Ho and Kalman 1966, for each section of the
-period). The range of this matrix is the observability matrix O[n], and A[n] takes O[n], shifted by
-one section, to O[n+1].
+dimension at section n is the rank of a Hankel matrix, whose block `[i, j]` is the response at
+section n + i to an input at section n - 1 - j (Ho and Kalman 1966, for each section of the period).
+The range of this matrix is the observability matrix O[n], and A[n] follows from O[n], shifted by
+one section, and O[n+1].
+
+`realized` makes a model from impulse responses (for `SeriesFit.model`, bounds and designs).
+`ranges` and `shifted` are also used by `joint/realization.py`.
 """
 
 from collections.abc import Sequence
@@ -22,10 +25,10 @@ from .descent import ROUNDING, positive
 Matrices = list[Float[np.ndarray, "_ _"]]
 """One matrix for each section."""
 
-# Sections in which a state is observed, at least, by default. Smaller: less averaging.
+# Least number of sections over which a state is observed, by default. Smaller: less averaging.
 _SHORTEST_HORIZON = 8
-# Factor by which a singular value must exceed the largest that noise alone makes, on average.
-# Larger: weak states are missed; smaller: noise makes states.
+# A singular value must exceed the largest one of noise alone (its mean) by this factor. Larger:
+# weak states are missed. Smaller: noise counts as states.
 _NOISE_MARGIN = 1.1
 
 
@@ -35,7 +38,8 @@ def default_horizon(N: int) -> int:
 
 
 def largest_of_noise(rows: int, columns: int) -> float:
-    """Return the singular value of a matrix of noise of variance one that states must exceed."""
+    """Return the singular value that states must exceed, for noise of variance one in a matrix of
+    this shape."""
     return _NOISE_MARGIN * (np.sqrt(rows) + np.sqrt(columns))
 
 
@@ -53,7 +57,7 @@ def realized(
     **Arguments:**
 
     - `noise`: variances of the Markov parameters. States below the noise are left out. Default:
-      those below rounding errors are.
+      only states below rounding errors are left out.
     - `dims`: dimension of the state at each section. Default: the ranks. `order`: the number of
       multipliers expected, a lower bound of dimensions.
 
@@ -130,7 +134,8 @@ def ranges(
 
 
 def shifted(bases: Matrices, ny: int) -> tuple[Matrices, Matrices]:
-    """Return A and C from O[n]: its first rows are C[n], the others O[n+1] A[n]."""
+    """Return A and C from O[n]: the first rows of O[n] are C[n], and the other rows are O[n+1]
+    A[n]."""
     A = []
     for now, later in zip(bases, [*bases[1:], bases[0]], strict=True):
         step, *_ = np.linalg.lstsq(later[:-ny], now[ny:])

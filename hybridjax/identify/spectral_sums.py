@@ -1,7 +1,9 @@
-"""Sums over experiments, for each line of the spectrum, from which HTFs are estimated.
+"""Sums over experiments, for each line of the spectrum, from which `estimate_htf` estimates HTFs.
 
-Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. The sums take the
-same memory for any number of experiments, and those of two sets of experiments add.
+Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. `spectral_sums`
+returns `SpectralSums`; experiments may come in parts, since the sums of two parts can be added
+(`_add`), so that memory does not depend on their number. Lines are selected in `_excited`, and
+spectra of outputs are computed in `_outputs`: look there if an estimate lacks lines or is shifted.
 """
 
 from collections.abc import Iterable, Iterator
@@ -23,18 +25,19 @@ from .descent import ROUNDING, positive
 Experiments = (
     ExperimentData | Annotated[Iterable[ExperimentData], Stream(ExperimentData, "data")]
 )
-"""Experiments, or parts of them one after the other."""
+"""Experiments, or an iterable of parts of them."""
 
 
-# Largest change of a line of the input from one window to the next, relative to the largest line.
-# Smaller: recorded inputs with noise are refused; larger: inputs of another period pass.
+# The input repeats if each of its lines changes from window to window by less than this, relative
+# to the largest line. Smaller: recorded inputs with noise are refused. Larger: inputs of another
+# period pass.
 _REPEATS = 1e-2
-# Part of the largest line of an input below which a line is not excited, where nobody chose it.
-# Smaller: rounding counts as a line; larger: weak lines are missed.
+# By default, a line of an input is excited if it exceeds this part of the largest line. Smaller:
+# rounding errors count as lines. Larger: weak lines are missed.
 SILENT_LINE = 1e-6
-# Signals whose crest factors are tested, at most, redraws of the phases of each, and its fewest
-# lines. Fewer signals or redraws: random phases count as optimized more often, by chance; fewer
-# lines: chance does as well as any choice of phases.
+# Largest number of signals whose crest factors are tested; number of redraws of the phases of each;
+# and least number of lines of a signal. Fewer signals or redraws: random phases count as optimized
+# more often, by chance. Fewer lines: random phases may be as good as optimized ones.
 _TESTED = 12
 _REDRAWS = 200
 _FEWEST_LINES = 8
@@ -88,13 +91,14 @@ class SpectralSums(NamedTuple):
     present: Float[np.ndarray, "K nu"]
     """The number of experiments with each input."""
     energies: Float[np.ndarray, "K nu M ny"]
-    """Sums of |Y[k + l P]|^2 over the experiments with each input."""
+    """Sums of |Y[k + l P]|^2 over the experiments that excite each input."""
     turned: Complex[np.ndarray, "K nu M ny"]
-    """Sums of Y[k + l P]^2, turned back by twice the phase of each input."""
+    """Sums of Y[k + l P]^2, with twice the phase of each input subtracted from its phase."""
     noise: Float[np.ndarray, "K M ny"]
     """Sums of the variance of Y[k + l P] between windows; zero for one window."""
     crest_factors: tuple[int, int]
-    """Signals that were tested, and those with crest factors below all redraws of their phases."""
+    """Number of signals that were tested, and number of those with a crest factor below all redraws
+    of their phases."""
     repeats: int
     """The number of windows that were averaged."""
     experiments: tuple[int, int]
@@ -105,7 +109,7 @@ class SpectralSums(NamedTuple):
         return self.line / self.setup.periods
 
     def solvable(self) -> Bool[np.ndarray, " K"]:
-        """Test which lines tell the responses to all inputs (and mirror images) apart."""
+        """Test at which lines the responses to all inputs (and mirror images) can be separated."""
         nu = len(self.setup.inputs)
         single = regular(self.gram[:, :nu, :nu])
         return np.where(self.mirrored, single & regular(self.gram), single)
@@ -148,7 +152,7 @@ def _sums_of_part(
     repeats: int,
     first: int,
 ) -> SpectralSums:
-    """Return the sums over one part, whose first experiment has the number `first`."""
+    """Return the sums over one part of the experiments. `first`: number of its first experiment."""
     windows = data.windows(repeats)
     experiment, line, U = _excited(data, windows, threshold, first)
     lines, index = np.unique(line, return_inverse=True)
@@ -195,7 +199,8 @@ def _sums_of_part(
 
 
 def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmonics):
-    """Return Y at lines k + m P for each entry k, the mean over the windows, and its variance."""
+    """Return, for each entry k, the mean of Y over the windows at lines k + m P, and the variance
+    of this mean."""
     N = data.n_sections
     P = data.periods
     shifts = P * np.asarray(harmonics, int)
@@ -209,7 +214,8 @@ def _outputs(data: ExperimentData, windows: list[slice], experiment, line, harmo
 
 
 def _excited(data: ExperimentData, windows: list[slice], threshold: float, first: int):
-    """Return experiment, line and U of every excited line, checked that they do not meet."""
+    """Return experiment, line and U of every excited line. Raises an error if lines of an
+    experiment disturb each other."""
     known = np.isfinite(data.u).all(axis=(1, 2), keepdims=True)
     u = np.where(known, data.u, 0.0)
     in_windows = [np.fft.rfft(u[:, window], axis=1) for window in windows]
@@ -256,8 +262,8 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
             continue
         angle = rng.uniform(0, 2 * np.pi, (_REDRAWS, len(lines)))
         spectra = np.zeros((_REDRAWS, len(size)), complex)
-        turns = np.exp(1j * angle)
-        spectra[:, lines] = size[lines] * turns
+        phasors = np.exp(1j * angle)
+        spectra[:, lines] = size[lines] * phasors
         waves = np.fft.irfft(spectra, len(signal), axis=1)
         draws = np.abs(waves).max(axis=1)
         tested += 1
@@ -275,8 +281,9 @@ def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
         x = getattr(a, name)
         y = getattr(b, name)
         if isinstance(x, tuple):
-            total = x[0] + y[0]
-            both[name] = (total, x[1] + y[1])
+            first = x[0] + y[0]
+            second = x[1] + y[1]
+            both[name] = (first, second)
             continue
         shape = (len(line), *x.shape[1:])
         both[name] = np.zeros(shape, x.dtype)

@@ -6,6 +6,10 @@ condition decays like $\sum_i a_i \lambda_i^p$. The multipliers $\lambda$ are th
 section, in every output and every experiment (after the first period, in which the part of the
 state with zero multipliers vanishes). All amplitudes are linear unknowns, which are eliminated, so
 that d multipliers are left (variable projection: Golub and Pereyra 1973).
+
+`remove_transient` returns the data without the transient. `_decays` finds the multipliers and the
+transients, from rows of the data in which the sinusoids cancel (`_free`): a wrong decay has its
+cause there.
 """
 
 import dataclasses
@@ -18,7 +22,7 @@ from scipy import linalg, optimize
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
 from .._core.showable import Showable
-from .._core.text import folded
+from .._core.text import folded, number
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData, Simulated
 from ..experiments.design.partition import line_class
@@ -28,8 +32,9 @@ from .series.records import start_responses
 from .spectral_sums import SILENT_LINE
 
 
-# The largest number of multipliers that is tried. Larger: records need 8 more cycles for each one
-# to be separated from all that repeats; smaller: slow modes of larger systems are missed.
+# Largest number of multipliers that is tried. Larger: for each further one, records need 8 more
+# cycles to separate the decay from everything that repeats. Smaller: slow modes of larger systems
+# are missed.
 _LARGEST_ORDER = 4
 
 
@@ -50,9 +55,9 @@ class TransientFit(Showable, eqx.Module):
     removed: Float[np.ndarray, "S ny"]
 
     def __repr__(self) -> str:
-        shown = ", ".join(f"{x:.4g}" for x in self.multipliers)
+        shown = ", ".join(number(z, 4) for z in self.multipliers)
         sizes = np.nanmax(self.removed, axis=0)
-        size = ", ".join(f"{x:.2g}" for x in sizes)
+        size = ", ".join(number(x, 2) for x in sizes)
         return folded(
             f"TransientFit(multipliers {shown}; removed rms up to {size}; {self.data!r})"
         )
@@ -121,7 +126,8 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     removed[data.ok] = np.sqrt(np.mean(window**2, axis=1))
     simulated = None
     if data.simulated is not None:
-        # Events, some of which lie in the cycles that were cut off, are left out.
+        # (The numbers of events are left out, since some events lie in the cycles that were cut
+        # off.)
         later = np.maximum(data.failed_at - N, 0)
         failed_at = np.where(data.failed_at >= 0, later, -1)
         simulated = Simulated(failed_at, data.error)
@@ -137,7 +143,8 @@ def _decays(
 ) -> tuple[Coefficients, Float[np.ndarray, "S n ny"]]:
     """Return the coefficients of the multipliers, and the transients of all experiments that ran.
 
-    **Arguments:** `classes`: those that are excited in each experiment; `everything`: or all.
+    **Arguments:** `classes`: classes that are excited in each experiment. `everything`: whether all
+    classes count as excited.
 
     **Raises:** `DefinitionError` if the transient cannot be told from the response.
     """
@@ -155,7 +162,7 @@ def _decays(
             f"{cycles} cycles with {cycles - least} lines per section do not tell the transient "
             "from the response: record more, or excite half of the lines (`lines='odd'`)."
         )
-    # With everything, all Q are the same.
+    # (With `everything`, all experiments have the same Q.)
     whole = [np.concatenate(left, axis=1)] if everything else left
     blocks = [(Q, _condensed(z)) for Q, z in zip(free, whole, strict=False)]
     numbers = sum(z.size for z in left)
@@ -207,7 +214,8 @@ def _excited_classes(
 
 
 def _condensed(z: Float[np.ndarray, "rows _"]) -> Float[np.ndarray, "rows _"]:
-    """Return a matrix with no more columns than rows, and the same residuals of regressions."""
+    """Return a matrix with no more columns than rows that gives the same residuals in
+    regressions."""
     if z.shape[1] <= len(z):
         return z
     return np.asarray(np.linalg.qr(z.T, mode="r")).T
@@ -230,12 +238,13 @@ def _free(classes: np.ndarray, P: int, cycles: int) -> Float[np.ndarray, "rows c
 
 
 def _start(records, free, d: int) -> Coefficients:
-    """Solve the equation of the decay, which records obey but for sinusoids, by least squares."""
+    """Solve the difference equation of the decay by least squares. (Records obey it except for the
+    sinusoids.)"""
     normal = np.zeros((d, d))
     right = np.zeros(d)
     cycles = records.shape[1]
     for Q, record in zip(free, records, strict=True):
-        # The same sinusoids, d periods fewer.
+        # The same sinusoids over d periods fewer.
         sinusoids = linalg.null_space(Q)[d:]
         keep = linalg.null_space(sinusoids.T).T
         delayed = [keep @ record[d - i : cycles - i] for i in range(d + 1)]

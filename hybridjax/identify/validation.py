@@ -1,8 +1,9 @@
-"""Is an identified model good enough? Simulation of data that it was not fitted to.
+"""`validate`: simulate an identified model on data to which it was not fitted, and test the
+residuals.
 
-`validate` simulates the model from initial states that fit best (`predicted` of the fits), and
-tests what is left. The tests themselves are in `series/residuals.py`: if a good model is rejected,
-see whether `whitened` takes the errors of the fit into account.
+The model is simulated from the initial states that fit best (`predicted` of the fits), and a
+`Validation` is returned. The tests themselves are in `series/residuals.py`. If a good model is
+rejected, look first at `whitened` there, which takes the errors of the fit into account.
 """
 
 import itertools
@@ -41,15 +42,17 @@ from .series.residuals import (
 )
 
 
-# Samples for each unknown of its initial condition and drift, which a record must exceed. Fewer:
-# short records agree with any model; more: records that could be compared are left out.
+# A record must have more than this many samples for each unknown of its initial condition and
+# drift. Fewer: short records agree with any model. More: records that could be compared are left
+# out.
 _SAMPLES_PER_UNKNOWN = 3
 
 
 def can_be_compared(
     model: LDTP | SeriesFit | Predictor, record: SectionSeries, free_start: bool
 ) -> bool:
-    """Test whether a record has samples beyond those that fit its initial condition and drift."""
+    """Test whether a record has enough samples, beyond those that determine its initial condition
+    and drift."""
     N = record.n_sections
     ny = record.y.shape[1]
     unknown = N * ny * drift_waves(record).shape[1]
@@ -62,8 +65,8 @@ def can_be_compared(
 
 # Cycles that a notebook draws. More: they are harder to see.
 _DRAWN = 4
-# Samples for each lag that is tested by default. Fewer: correlations of too few samples; more: late
-# correlations are missed.
+# Number of samples for each lag that is tested by default. Fewer: correlations of too few samples.
+# More: correlations at large lags are missed.
 _SAMPLES_PER_LAG = 4
 
 
@@ -148,7 +151,8 @@ class Validation(Showable, eqx.Module):
 
     @property
     def _threshold(self) -> float:
-        """p value below which one of all outputs fails a test (Bonferroni)."""
+        """p-value below which a single output fails a test, if all outputs are tested
+        (Bonferroni)."""
         return self.alpha / len(self.outputs)
 
     @property
@@ -298,7 +302,7 @@ def validate(
     if not isinstance(tested, LDTP) and not isinstance(model, LDTP):
         roots = list(model.spread(grid))
     if isinstance(tested, LDTP):
-        # Outputs in units of their size, so that none is neglected.
+        # (Outputs in units of their magnitude, so that all have the same weight.)
         of_section = np.diag(prepared.scale**2)
         S = np.tile(of_section, (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
@@ -321,7 +325,7 @@ def validate(
     size = np.sqrt(square_of_outputs)
 
     autocorrelation, whiteness = whiteness_test(whitened(error, roots), lags)
-    # (Inputs of so many lags are known from here on.)
+    # (From these samples on, all lagged inputs are known.)
     is_late = (grid.age >= lags)[..., None]
     late = np.where(is_late, error, np.nan)
     driving = list(itertools.compress(outside, kept))
@@ -384,7 +388,8 @@ def _simulated(model: LDTP | Fit, record: SectionSeries) -> LDTP | SeriesFit | L
 
 
 def _as_series_fit(fit: StructuredFit) -> SeriesFit:
-    """Return the same model with numerators at sections, whose errors are not known."""
+    """Return the model of a fit to HTFs as a `SeriesFit`, with numerators at the sections. Their
+    errors are not known."""
     N = fit.n_sections
     lags = np.outer(np.arange(N), fit.harmonics)
     waves = np.exp(2j * np.pi * lags / N)
@@ -406,7 +411,7 @@ def _as_series_fit(fit: StructuredFit) -> SeriesFit:
 
 
 def _tested(model: LDTP | SeriesFit | LDTPFit) -> LDTP | SeriesFit | Predictor:
-    """Return what predicts the outputs."""
+    """Return the model that predicts the outputs."""
     if isinstance(model, LDTPFit):
         return model.predictor or model.model
     return model
@@ -419,7 +424,7 @@ def _lags(prepared: PreparedRecords, grid: CycleGrid) -> int:
     """
 
     def count(lags: int) -> Int[np.ndarray, "N ny"]:
-        """Return how often each section was sampled with so many samples before it."""
+        """Return how many samples each section has with at least `lags` samples before them."""
         is_late = (grid.age > lags)[..., None]
         return (grid.sampled & is_late).sum(axis=(0, 1))
 

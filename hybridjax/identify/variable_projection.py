@@ -1,9 +1,15 @@
-r"""Harmonic transfer functions with their numerators eliminated.
+r"""The least-squares problem of `fit_multipliers`: HTFs with one common denominator, whose
+numerators are eliminated.
 
 Every entry of the HTFs (one harmonic, output and input) obeys $H = B / \chi + \varepsilon$ with a
-polynomial B in $z^{-1}$ of its own and one $\chi(z^{-N}) = 1 + c_1 z^{-N} + \ldots + c_d z^{-dN}$
-for all. For given c the best numerators solve a linear least-squares problem, whose residual
+polynomial B in $z^{-1}$ of its own, and a common $\chi(z^{-N}) = 1 + c_1 z^{-N} + \ldots + c_d
+z^{-dN}$. For given c the best numerators solve a linear least-squares problem, whose residual
 depends on c alone (variable projection: Golub and Pereyra 1973).
+
+`multipliers.py` calls `grouped` (entries with equal weights become one `HTFGroup`),
+`maximum_likelihood` (the descent over c) and `summarize` (covariance and cost). A *response* is an
+entry of the HTFs, or a combination of two entries with real numerator. Residuals and their
+derivatives are those of `misfit_of`: test these first.
 
 Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$.
 """
@@ -31,11 +37,12 @@ from .descent import (
 from .weights import check_values, error_weights
 
 
-# Decimal digits to which weights must agree (up to a factor) to be solved for together. More: a
-# group for each entry, which takes longer; fewer: weights that are off by as much.
+# Number of decimal digits to which weights must agree (up to a factor) for entries to be in one
+# group. More: a group for each entry, which takes longer. Fewer: wrong weights.
 EQUAL_WEIGHTS = 9
-# Weighted solutions of the linearized problem, at most, and the change of c, relative to 1 + |c|,
-# that ends them. More, smaller: a closer start, which the descent does not need.
+# Largest number of weighted solutions of the linearized problem; and the change of c, relative to 1
+# + |c|, that ends them. More solutions or a smaller change: the descent starts closer to the
+# minimum, which it does not need.
 _MAX_REWEIGHTINGS = 6
 _SETTLED_START = 1e-3
 
@@ -47,15 +54,17 @@ class HTFGroup(NamedTuple):
     """
 
     harmonic: Int[np.ndarray, " K"]
-    """The position of a response's harmonic in the HTFs,"""
+    """The position of a response's harmonic in the HTFs."""
     mirror: Int[np.ndarray, " K"]
-    """that of the opposite harmonic, -1 where there is no other,"""
+    """The position of the opposite harmonic; -1 if there is none."""
     share: Complex[np.ndarray, " K"]
-    """the factor of the response in the HTF of its harmonic (conjugate: in the opposite one),"""
+    """The factor of the response in the HTF of its harmonic. (The conjugate is its factor in the
+    opposite harmonic.)"""
     channel: Int[np.ndarray, "K 2"]
-    """and its output and input."""
+    """Output and input of the response."""
     line: Int[np.ndarray, " E"]
-    """The noise that an equation's errors stem from, that of its frequency or its class,"""
+    """Equations with the same number have errors from the same noise: those of one frequency, or of
+    one class of frequencies."""
     period_delay: Complex[np.ndarray, " E"]
     """z^-N, the delay by one period."""
     basis: Float[np.ndarray, "2*E r"]
@@ -80,13 +89,15 @@ class HTFGroup(NamedTuple):
     def weighted(
         self, c: Coefficients, values: Complex[np.ndarray, "E n"]
     ) -> Float[np.ndarray, "2*E n"]:
-        """Return the rows of chi H = B, weighted: errors of H are multiplied by chi there."""
+        """Return the weighted rows of the equation chi H = B. (Errors of H are multiplied by
+        chi.)"""
         return split(self._weight_by_chi(c)[:, None] * values)
 
     def numerator_space(
         self, c: Coefficients
     ) -> tuple[Float[np.ndarray, "2*E r"], Float[np.ndarray, "r r"]]:
-        """Return an orthonormal basis of the numerators' weighted values, and its QR's triangle."""
+        """Return an orthonormal basis of the numerators' weighted values, and the triangular factor
+        of the QR decomposition."""
         weight = np.tile(self._weight_by_chi(c), 2)
         return np.linalg.qr(weight[:, None] * self.basis)
 
@@ -108,11 +119,13 @@ class Misfit(NamedTuple):
     residual: Float[np.ndarray, "2 E K"]
     """In units of the error."""
     jacobian: Float[np.ndarray, "d 2 E K"]
-    """Its derivative with respect to c (without what vanishes with the residual: Kaufman 1975)."""
+    """Derivative of the residual by c. (The term that is proportional to the residual is omitted:
+    Kaufman 1975.)"""
     noise: Float[np.ndarray, "d d"]
-    """Part of jacobian^T jacobian that comes from errors of variance 1 in the data, per entry."""
+    """Expected part of jacobian^T jacobian that is due to errors in the data, per entry, for errors
+    of variance 1."""
     leverage: Float[np.ndarray, "2 E"]
-    """The share of each real equation that the numerators explain for any data."""
+    """The share of each real equation that the numerators explain, whatever the data are."""
 
 
 def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
@@ -123,7 +136,7 @@ def misfit_of(group: HTFGroup, c: Coefficients, noise: bool = False) -> Misfit:
     below = chi(group.period_delay, c)[:, None]
     target = group.weighted(c, below * group.data)
     explained = q @ (q.T @ target)
-    # The delays divided by chi (up to its phase, which all rows share).
+    # Delays divided by chi, without the phase of chi, which is common to all rows.
     powers = np.arange(1, d + 1)[:, None, None]
     delays = group.period_delay[:, None] ** powers / below
 
@@ -146,8 +159,8 @@ def late_columns(
 ) -> tuple[Float[np.ndarray, "n d1"], Float[np.ndarray, " E"]]:
     r"""Return $z^{-jN} H$, j = 0, ..., d, less numerators and weighted by $1/|\chi|$.
 
-    The coefficients of chi combine the columns to errors alone. Then the part of each equation's
-    variance that numerators leave.
+    Combined with the coefficients of chi, the columns leave errors only. Also returns the part of
+    each equation's variance that the numerators leave.
     """
     q, _ = group.numerator_space(c)
     delay = group.period_delay[:, None]
@@ -165,8 +178,8 @@ def late_columns(
 def delayed_responses(groups: Groups, c: Coefficients) -> tuple[np.ndarray, np.ndarray]:
     """Return roots of two Gram matrices of the delayed responses of all groups.
 
-    The first root is in units of the second, which is that of the Gram matrix that is expected from
-    errors of variance 1. (The Gram matrix itself would lose half of the digits.)
+    The second root is that of the Gram matrix expected for errors of variance 1, and the first one
+    is in its units. (Without roots, half of the digits would be lost.)
     """
     delays = np.arange(len(c) + 1)
     apart = np.abs(delays[:, None] - delays)
@@ -210,7 +223,7 @@ def maximum_likelihood(
     """Return the coefficients with the smallest misfit, and whether they are a minimum.
 
     **Arguments:** `start`: where the descent starts. Default: the solution of the linearized
-    problem. `rough`: whether to stop where noise of variance one explains the next step.
+    problem. `rough`: whether to stop when noise of variance one could explain the next step.
     """
     if start is None:
         start = _linearized(groups, order)
@@ -246,11 +259,11 @@ def summarize(
     The cost is the sum of squares of the misfit in units of the errors supposed; its expected value
     is the number of real equations that the numerators leave.
 
-    With the residuals r, their Jacobian J and its part Q that errors make,
-    $\mathrm{Cov}(c) = (J^T J - Q)^{-1} M (J^T J - Q)^{-1}$, where M is the covariance of the
-    gradient $J^T r$: $J^T J$ for errors of the variances supposed, or the sum over frequencies of
-    the squares of their parts of the gradient. Each part is first made as large as it is on average
-    before c takes its share of it (Bell and McCaffrey 2002).
+    With the residuals r, their Jacobian J and its part Q that errors make, $\mathrm{Cov}(c) = (J^T
+    J - Q)^{-1} M (J^T J - Q)^{-1}$, where M is the covariance of the gradient $J^T r$: $J^T J$ for
+    errors of the variances supposed, or the sum over frequencies of the squares of their parts of
+    the gradient. The fit of c reduces each part; this is corrected on average (Bell and McCaffrey
+    2002).
     """
     d = len(c)
     lines = 1 + max(int(group.line.max()) for group in groups)
@@ -260,8 +273,8 @@ def summarize(
     for group in groups:
         misfit = misfit_of(group, c, noise=True)
         noise += misfit.noise * group.size
-        # A residual is smaller than the error, by the share of its equation in the numerators (to
-        # rounding, at most all of it).
+        # A residual is smaller than the error, since the numerators fit a share of its equation.
+        # (This share is at most 1, up to rounding.)
         left = 1 - np.minimum(misfit.leverage, 1 - 1e-15)
         error = misfit.residual / np.sqrt(left)[..., None]
         slopes = misfit.jacobian
@@ -291,7 +304,7 @@ def numerators_of(group: HTFGroup, c: Coefficients) -> Inexact[np.ndarray, "R K"
 def unfold(
     htf: HTF, groups: list[HTFGroup], numerators: Sequence[Inexact[np.ndarray, "R K"]]
 ) -> Complex[np.ndarray, "M R ny nu"]:
-    """Return the numerators of the HTFs from those of the responses of each group."""
+    """Return the numerators of the HTFs, from the numerators of the responses of each group."""
     _, _, ny, nu = htf.H.shape
     shape = (len(htf.harmonics), ny, nu, len(numerators[0]))
     out = np.zeros(shape, complex)
@@ -306,18 +319,22 @@ def unfold(
 
 
 def grouped(htf: HTF, order: int, extra_lags: int | None) -> list[HTFGroup]:
-    """Group all entries of the HTFs, weighted by their variances, for so many multipliers."""
+    """Group all entries of the HTFs, weighted by their variances, for a fit with `order`
+    multipliers."""
     size = numerator_size(htf, order, extra_lags)
     return group_htf(htf, error_weights(htf, check_values(htf)), size)
 
 
 class FittedResponse(NamedTuple):
-    """A combination of entries of HTFs whose numerator solves a problem of its own."""
+    """An entry of the HTFs, or a combination of two entries, whose numerator does not depend on
+    other responses."""
 
     harmonic: tuple[int, int]
-    """The positions of its harmonic and of the opposite one, which is -1 where there is none."""
+    """The positions of its harmonic and of the opposite harmonic; the latter is -1 if there is
+    none."""
     share: complex
-    """Its factor in the HTF of its harmonic (conjugate: in the opposite one)."""
+    """The factor of the response in the HTF of its harmonic. (The conjugate is its factor in the
+    opposite harmonic.)"""
     channel: tuple[int, int]
     """Output and input."""
     values: Complex[np.ndarray, " E"]
@@ -399,10 +416,10 @@ def equal_weights(
     matrix: Complex[np.ndarray, "E u"],
     responses: list[FittedResponse],
 ) -> list[HTFGroup]:
-    """Return responses whose numerators solve the same problem, one group for each weight.
+    """Group responses whose numerators solve the same problem, one group for each weight.
 
-    **Arguments:** `sources`: for each frequency the number of its noise, see `HTFGroup.line`.
-    `matrix`: maps u real coefficients to the numerator's values.
+    **Arguments:** `sources`: for each frequency a number that says from which noise its errors
+    come, see `HTFGroup.line`. `matrix`: maps u real coefficients to the numerator's values.
     """
     harmonic, share, channel, data, weights = map(
         np.array, zip(*responses, strict=True)
@@ -445,7 +462,7 @@ def powers_basis(
     (smallest) coefficients that make each element.
     """
     u, s, vh = np.linalg.svd(powers, full_matrices=False)
-    # (One combination less would change bounds by 0.3 %.)
+    # (The threshold is low, because leaving out one combination more would change bounds by 0.3 %.)
     kept = s > 0.1 * ROUNDING * s[0]
     columns = vh[kept].conj().T
     return u[:, kept], columns / s[kept]
@@ -460,7 +477,8 @@ def numerator_size(htf: HTF, order: int, extra_lags: int | None) -> int:
     beyond = N if extra_lags is None else extra_lags
     size = order * N + beyond + 1
     harmonics = {m % N for m in htf.harmonics}
-    # Half of a pair, or a harmonic that is its own mirror image, has half as many coefficients.
+    # (Each harmonic of a pair m, -m, and a harmonic that is its own mirror image, has half as many
+    # coefficients.)
     unknown = [size if -m % N in harmonics else 2 * size for m in harmonics]
     entries = len(htf.outputs) * len(htf.inputs)
 
@@ -485,12 +503,12 @@ def error_spectrum(
 ) -> Float[np.ndarray, "F ny nu"]:
     r"""Return the variance of the errors of each output, zero where the residual is zero.
 
-    Noise of the sensors is taken for white; noise that drives the system has the system's poles,
-    at all harmonics. The variance of an output is therefore modeled as $a + b / |\chi|^2$, times
-    the variances `lines` of frequencies and inputs.
+    Sensor noise is assumed to be white. Noise that drives the system has the system's poles at all
+    harmonics. Therefore the variance of an output is modeled as $a + b / |\chi|^2$, times the
+    variances `lines` of frequencies and inputs.
 
-    This is a step of scoring towards the largest restricted likelihood (Patterson and Thompson
-    1971), from the weights of the groups, which accounts for the fitted numerators.
+    This is one scoring step towards the largest restricted likelihood (Patterson and Thompson
+    1971), from the weights of the groups. It accounts for the fitted numerators.
     """
     square = np.zeros((outputs, 2))
     expected = np.zeros((outputs, 2, 2))

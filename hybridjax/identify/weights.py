@@ -14,8 +14,8 @@ from ..linear.htf import HTF
 
 Entries = Float[np.ndarray, "... ny _"]
 
-# Smallest error that an HTF is supposed to have, relative to the rms of its output: that of
-# rounding. Smaller: infinite weights; larger: exact outputs count too little beside noisy ones.
+# Smallest error that is assumed for an HTF, relative to the rms of its output: a rounding error.
+# Smaller: infinite weights. Larger: exact outputs get too little weight compared to noisy ones.
 SMALLEST_ERROR = 1e-15
 
 
@@ -54,13 +54,13 @@ def error_weights(
 ) -> Float[np.ndarray, "M F ny nu"]:
     """Return one over the standard deviation of real and imaginary part, known or supposed.
 
-    Variances that were estimated with few degrees of freedom are poor weights: they are replaced
-    by the nearest product of a factor for each frequency and one for each modulus of a harmonic.
-    (Variances have this form for white noise and any spectrum of the input.) If any variance is
-    zero, they are taken as they are.
+    Variances that were estimated with few degrees of freedom are poor weights: they are replaced by
+    the nearest product of two factors: one for each frequency, and one for each modulus of a
+    harmonic. (For white noise, variances have this form whatever the spectrum of the input is.) If
+    any variance is zero, variances are used as they are.
 
-    **Arguments:** `rms`: of each output. Without variances, the standard deviation is supposed to
-    be a constant part of it, times that of white noise at each line (`line_variances`).
+    **Arguments:** `rms`: rms of each output. Without variances, the standard deviation is assumed
+    to be a constant part of the rms, times that of white noise at each line (`line_variances`).
     """
     if htf.variance is None:
         deviation = rms[:, None] * np.sqrt(line_variances(htf))
@@ -77,7 +77,8 @@ def _separated(
     variance: Float[np.ndarray, "M F ny nu"],
     dof: Float[np.ndarray, " F"],
 ) -> Float[np.ndarray, "M F ny nu"]:
-    """Return the nearest product of a factor for each frequency and one for each harmonic."""
+    """Return the nearest product of two factors: one for each frequency, and one for each modulus
+    of a harmonic."""
     _, same = np.unique(np.abs(harmonics), return_inverse=True)
     groups = same.max() + 1
     size = np.ones((groups, 1, *variance.shape[2:]))
@@ -91,7 +92,8 @@ def _separated(
 
 
 def line_variances(htf: HTF) -> Float[np.ndarray, "F 1 nu"]:
-    """Return variances of each frequency and input by white noise, relative to their mean."""
+    """Return the variances that white noise causes at each frequency and input, relative to their
+    mean."""
     if htf.power is None:
         return np.ones((len(htf.frequencies), 1, len(htf.inputs)))
     variance = 1 / np.asarray(htf.power)[:, None]
@@ -107,12 +109,12 @@ def weights_of(variance: Entries, rms: Float[np.ndarray, " ny"]) -> Entries:
 def estimated_noise(largest: float, misfit: float) -> tuple[float, float]:
     r"""Return the mean square of the noise in units of `htf.variance`, and its standard deviation.
 
-    Both are 1 for variances that are known. With $\nu$ complex degrees of freedom
-    $|\varepsilon|^2 / v$ has Fisher's distribution with 2 and $2 \nu$: its mean is
-    $L = \nu / (\nu - 1)$, its standard deviation $L \sqrt{L / (2 - L)}$. The errors of a fit with
-    such weights have $L / (2 - L)$ times the covariance that the weights suggest, in the limit of
-    many lines. Weights that are pooled have more degrees of freedom than each variance, so that L
-    is taken from the misfit of a fit, as far as $\nu$ allows.
+    Both are 1 for variances that are known. With $\nu$ complex degrees of freedom $|\varepsilon|^2
+    / v$ has Fisher's distribution with 2 and $2 \nu$: its mean is $L = \nu / (\nu - 1)$, its
+    standard deviation $L \sqrt{L / (2 - L)}$. The errors of a fit with such weights have $L / (2 -
+    L)$ times the covariance that the weights suggest, in the limit of many lines. Pooled weights
+    have more degrees of freedom than a single variance. Therefore L is estimated from the misfit of
+    a fit, up to its value for $\nu$.
 
     **Arguments:** `largest`: `largest_misfit` of the HTFs. `misfit`: cost of the fit relative to
     its expected value.
@@ -127,7 +129,7 @@ def estimated_noise(largest: float, misfit: float) -> tuple[float, float]:
 
 
 def largest_misfit(htf: HTF) -> float:
-    """Return the misfit that the scatter of variances explains."""
+    """Return the largest misfit that the scatter of estimated variances can explain."""
     if htf.variance_dof is None:
         return 1.0
     dof = float(np.median(htf.variance_dof.dof))
@@ -139,8 +141,8 @@ def neighbor_correlation(
     values: Complex[np.ndarray, "M F ny nu"],
     f: Float[np.ndarray, " F"],
 ) -> float:
-    """Return the correlation of errors at neighboring frequencies, in which errors that are
-    rounding beside the `values` count as zero."""
+    """Return the correlation of errors at neighboring frequencies. Errors that are rounding errors
+    of the `values` count as zero."""
     ordered = error[:, np.argsort(f)]
     later = ordered[:, 1:]
     earlier = ordered[:, :-1]
@@ -153,5 +155,6 @@ def neighbor_correlation(
 
 
 def are_alike(correlation: float, dof: float) -> bool:
-    """Test for a correlation of errors that is not chance, and large: the model is too simple."""
+    """Test whether errors are correlated more than by chance, and strongly: the model is then too
+    simple."""
     return correlation > max(0.1, 5 / np.sqrt(dof))

@@ -110,8 +110,8 @@ def _unit_roots(A: Array, f: Array) -> Array:
     """z^n (N, F, 1, 1) at each section."""
     index = np.arange(len(A))[:, None, None, None]
     n = index / len(A)
-    angles = 2j * np.pi * n * f[:, None, None]
-    return namespace(A).exp(angles)
+    exponent = 2j * np.pi * n * f[:, None, None]
+    return namespace(A).exp(exponent)
 
 
 def _states(A: Array, forcing: Array, f: Array) -> Array:

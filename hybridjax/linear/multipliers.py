@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from ..errors import ComputationError
 
@@ -19,11 +19,11 @@ Matrix = Float[np.ndarray, "_ _"]
 # Sweeps of the orthogonal iteration. Fewer: moduli that differ by a factor of ten are not told
 # apart, and the smaller one loses digits. More: time for moduli that hardly differ.
 _MOST_SWEEPS = 16
-# Part of a basis that leaves its subspace in one turn, below which it is rounding. Smaller: it
-# hides that a subspace was found. Larger: multipliers lose digits.
+# A subspace is found if the product maps a basis of it into the subspace, up to this part of the
+# basis. Smaller: rounding hides that it was found. Larger: multipliers lose digits.
 _SETTLED = 1e-14
-# Change of that part from sweep to sweep that is no progress. Smaller: sweeps in vain. Larger:
-# subspaces that are about to be found are missed.
+# If that part changes by less than this factor from one sweep to the next, there is no progress.
+# Smaller: sweeps in vain. Larger: subspaces that are about to be found are missed.
 _STALLED = 4.0
 
 
@@ -60,8 +60,13 @@ def product_eigenvalues(
         return np.zeros(0, complex)
     blocks = [_eigenvalues(block) for block in _diagonal_blocks(regular)]
     eigenvalues = np.concatenate(blocks)
-    order = np.lexsort((-np.imag(eigenvalues), -np.abs(eigenvalues)))
-    return eigenvalues[order]
+    return eigenvalues[largest_first(eigenvalues)]
+
+
+def largest_first(values: Complex[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The indices that sort complex numbers by decreasing modulus; of a conjugate pair, the number
+    with positive imaginary part comes first."""
+    return np.lexsort((-np.imag(values), -np.abs(values)))
 
 
 def _balanced(factors):

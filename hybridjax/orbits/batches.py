@@ -1,4 +1,13 @@
-"""Cycles of systems side by side, each from a guess of its own, in lanes of the host."""
+"""Limit cycles of many systems of one class, by Newton's method side by side on the host.
+
+`limit_cycles.py` makes `Tiles` of the systems of a sweep and calls `Tiles.solve`, which returns
+`Rounds`: the last Newton step of each system, with its result code. Each system begins from a guess
+of its own, mostly the cycle of its nearest neighbor in the parameters. A *turn* is one application
+of the return map: the flow from the section back to it. A *tile* is a number of systems that are
+computed by one call; in it, each system is a *lane*, an entry on the last axis of every array. If a
+system fails here whose cycle `find_limit_cycle` finds, look at `_step` (Newton) and `_again`
+(further attempts).
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -27,6 +36,7 @@ from .guess import require_similar
 from .newton import FEW_STEPS
 from .return_map import ReturnMap, Turn
 from .rivals import coincide, events_on
+from .scale import in_sizes
 from .shooting import excess, newton_steps, one_by_one
 
 
@@ -36,13 +46,14 @@ _SETTLE = 8, 0, 40
 
 
 def _apart(map: ReturnMap, lanes: Lanes) -> Lanes:
-    """Lanes as single ones, on the first axis; the lane of a single system as it is."""
+    """The lanes of many systems, moved to the first axis. The lane of a single system is returned
+    as it is."""
     return jax.tree_util.tree_map(one_by_one, lanes) if map.expected.ndim else lanes
 
 
 def _turn(map: ReturnMap):
-    """The anchor, the expected period, one turn with its Jacobian, and whether events coincide on
-    it, of a system, or of systems side by side on the host."""
+    """One turn of a system, or of many systems side by side on the host. Returns the anchor, the
+    expected period, the turn with its Jacobian, and whether events coincide on it."""
     turn = map.turn_with_jacobian(map.each(map.anchor.q.T))
     assert turn.tapes is not None
     together = coincide(map.structure, events_on(map, turn.tapes), turn.period)
@@ -58,8 +69,8 @@ def _verdict(map: ReturnMap, turn: Turn):
 
 
 def _settle(map: ReturnMap, periods: int):
-    """The ends of a simulation of some periods, at the guess's phase or section (NaN for systems
-    that do not get there), and expected periods."""
+    """Simulate some periods, and on to the phase of the clock or to the section at which the guess
+    begins. Returns the ends (NaN for systems that do not reach it), and the expected periods."""
     patient = Settings(TRANSIENT, TRANSIENT, 512 * periods, map.settings.scale)
     s = map.structure
     anchor = map.anchor
@@ -81,24 +92,24 @@ class Rounds(NamedTuple):
 
     anchor: Lanes
     excess: Float[np.ndarray, " S"]
-    """Size of that step relative to the tolerance; infinite for a turn that was too long, NaN for
-    one that failed."""
+    """Length of the last Newton step relative to the tolerance; infinite if the turn was too long,
+    NaN if the turn failed."""
     period: Float[np.ndarray, " S"]
     turn: Turn
-    """Without the codes of events, which are in `codes`."""
+    """The last turn. Its codes of events are in `codes` instead."""
     codes: Int[np.ndarray, "S E"]
     """Codes of events, padded with -1."""
     together: Bool[np.ndarray, " S"]
-    """Whether two of them coincide."""
+    """Whether two events of the turn coincide."""
     result: Int[np.ndarray, " S"]
     steps: Int[np.ndarray, " S"]
 
 
 class Known(NamedTuple):
-    """Cycles of K systems, from which others begin."""
+    """Known cycles of K systems, which serve as guesses for other systems."""
 
     numbers: Float[np.ndarray, "K p"] | None
-    """Those of the systems (see `numbers_of`)."""
+    """Parameters of the K systems (see `numbers_of`)."""
     anchor: Lanes
     period: Float[np.ndarray, " K"]
     result: Int[np.ndarray, " K"]
@@ -108,7 +119,7 @@ class Tiles(NamedTuple):
     """Systems, and how they are solved."""
 
     systems: HybridSystem
-    """Their arrays have a leading axis of S systems."""
+    """The systems; their arrays have a leading axis of S."""
     map: ReturnMap
     """The return map of the guess, with the settings asked for, on the host."""
     periods: Float[np.ndarray, " S"] | None
@@ -119,10 +130,13 @@ class Tiles(NamedTuple):
     known: Known | None = None
 
     def solve(self, S: int) -> Rounds:
-        """Newton's method for all systems, each from the nearest known cycle, or, if none is known,
-        from those of a few systems, spread over all, that begin from the guess. Systems that fail
-        begin again from the end of a simulation, which begins on the cycle of the nearest system,
-        then from that cycle."""
+        """Newton's method for all systems, each from the nearest known cycle. If no cycle is known,
+        a few systems, spread over all, begin from the guess, and the others from the cycles of
+        these few.
+
+        Systems that fail begin again from the cycle of the nearest system: first from the end of a
+        simulation that begins on it, then from the cycle itself.
+        """
         numbers = numbers_of(self.systems)
         order = np.random.default_rng(0).permutation(S)
         known = self.known
@@ -173,7 +187,7 @@ class Tiles(NamedTuple):
         self, rows, out: Rounds, guesses: Callable, settle: tuple[int, ...]
     ) -> Rounds:
         """More attempts for the systems that failed: from guesses, or from the ends of simulations
-        of so many periods."""
+        that last `periods` periods."""
         for periods in settle:
             failed = np.flatnonzero(out.result != Result.OK)
             if not len(failed):
@@ -226,16 +240,17 @@ class Tiles(NamedTuple):
         anchor, period, turn, codes, together = self._turn(rows, anchor, period)
         scale = np.asarray(self.map.settings.scale)
         sizes = scale[anchor.chart[:, 0]]
-        jacobian = turn.jacobian * sizes[:, None, :] / sizes[:, :, None]
+        jacobian = in_sizes(turn.jacobian, sizes)
         step = newton_steps(jacobian, turn.residual / sizes)
         q = anchor.q[..., 0] + step * sizes
         size = excess(q / sizes, step)
-        # A turn that closes but met its section too often was given too long a period.
+        # If a turn closes but has met its section too often, the expected period was too long.
         extra = turn.closed & (turn.meetings > self.map.multiplicity)
         period[extra] = (
             self.map.multiplicity * turn.period[extra] / turn.meetings[extra]
         )
-        # (Newton's method does not lead to a cycle that begins in another chart: turns do.)
+        # (Newton's method does not change the chart at the beginning, but a turn may end in another
+        # chart.)
         is_elsewhere = (turn.end.chart != anchor.chart)[:, 0]
         other = (turn.result == Result.OK) & is_elsewhere
         anchor = anchor._replace(q=q[..., None])
@@ -276,8 +291,8 @@ class Tiles(NamedTuple):
         options=(),
         then=lambda x: x,
     ):
-        """`function` of the return maps of some systems, and of further arguments, in calls of few
-        sizes. (JAX compiles operations on numbers of systems for each size.)"""
+        """Call `function` with the return maps of some systems and further arguments, in calls of
+        few different sizes. (JAX compiles each operation once for each size.)"""
         map = self.map
 
         def run(k):
@@ -329,7 +344,7 @@ def tiles_of(
 
 
 def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
-    """Some of many systems, side by side."""
+    """The systems `rows`, side by side."""
     arrays, static = eqx.partition(systems, eqx.is_array)
     last = jax.tree_util.tree_map(
         lambda x: np.moveaxis(np.asarray(x)[rows], 0, -1), arrays
@@ -339,7 +354,7 @@ def in_lanes(systems: HybridSystem, rows: Int[np.ndarray, " n"]) -> PerLane:
 
 
 def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
-    """The numbers of systems, one row for each."""
+    """The parameters of systems, one row for each system."""
     arrays = jax.tree_util.tree_leaves(eqx.filter(systems, eqx.is_inexact_array))
     rows = [np.asarray(x).reshape(len(x), -1) for x in arrays]
     return np.concatenate(rows, axis=1)
@@ -348,8 +363,9 @@ def numbers_of(systems: HybridSystem) -> Float[np.ndarray, "S p"]:
 def nearest(
     numbers: Float[np.ndarray, "n p"], known: Float[np.ndarray, "K p"]
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """The distances of systems to the nearest known ones, and the places of these. Each number
-    counts in units of its spread. (Those that are not finite are replaced by the mean.)"""
+    """For each system, the distance to the nearest known system, and the index of the latter. Each
+    parameter is measured in units of its spread. (Parameters that are not finite are replaced by
+    the mean.)"""
     from scipy.spatial import KDTree  # (a third of a second)
 
     finite = np.ma.masked_invalid(np.concatenate([known, numbers]))
@@ -370,7 +386,7 @@ def _join(*parts):
 
 
 def _of_one_width(parts):
-    """Codes of events with as many columns as the widest, padded with -1; other arrays as they
+    """Pad codes of events with -1 to the same number of columns. Other arrays are returned as they
     are."""
     width = max((x.shape[1] for x in parts if x.ndim == 2), default=0)
     if all(x.ndim != 2 or x.shape[1] == width for x in parts):
@@ -388,7 +404,8 @@ def _of_one_width(parts):
 
 
 def _replace(out: Rounds, rows, new: Rounds) -> Rounds:
-    """`out` with other values in some rows, which are written in place if they fit."""
+    """`out` with the values of `new` in some rows. They are written in place if their shapes
+    agree."""
 
     def put(x, y):
         x, y = _of_one_width((x, y))

@@ -1,4 +1,11 @@
-"""The reason for which a branch of limit cycles ends, read from its last cycle."""
+"""The reason for which a branch of limit cycles ends, read from its last cycle.
+
+`branches.py` calls `explained` with the last cycle of a branch and the result of the turn that
+failed beyond it, and gets an `End`: a sentence, and the place. `explained` tries the causes one
+after the other, and the first one that holds is the reason. A *visit* is the stay of the cycle in
+one chart between two events. If a branch reports the wrong reason, look at the order in
+`explained`.
+"""
 
 from typing import NamedTuple
 
@@ -15,23 +22,26 @@ from .guess import is_default
 from .verdict import Visit, visits_of
 
 
-# A guard or a section is touched if its rate is below this part of the rate that the motion along
-# the cycle could make. Larger: transversal events are called grazing. Smaller: the last cycle of a
-# branch, which ends a little before, is not recognized.
+# A guard or a section is touched if its rate is below this part of the largest rate that it could
+# have at the speed of the cycle. Larger: transversal events are called grazing. Smaller: the last
+# cycle of a branch, which ends a little before, is not recognized.
 _SLOW = 0.02
-# Two events, or a guard and zero, are close if less than this part of the period, or of the range
-# of the guard, is between them. Larger and smaller: as above.
+# Two events are close if their times differ by less than this part of the period; a guard is close
+# to zero if it is less than this part of its range. Larger: events that are merely near each other
+# get this reason. Smaller: the last cycle of a branch, which ends a little before, is not
+# recognized.
 _CLOSE = 0.02
 
-# A cycle has shrunk to a point if its states move less than this, in sizes of the states on the
+# A cycle has shrunk to a point if its states move by less than this part of their magnitudes on the
 # first cycle. Larger: small cycles are called equilibria. Smaller: a branch whose section does not
 # contain the equilibrium ends before.
 _SMALL = 0.02
-# The cycle passes an equilibrium if nothing moves by more than this, in sizes of the states, in a
-# time of one period. Larger: slow cycles count. Smaller: a branch ends before.
+# The cycle passes an equilibrium if there is a point with rates so small that no state would move
+# by more than this part of its magnitude in one period. Larger: slow cycles get this reason.
+# Smaller: the branch ends before its points are this slow, and gets no reason.
 _REST = 0.1
 
-# Results of a turn that failed beyond the end of a branch, and may have one of these causes.
+# Results of a failed turn for which a cause is looked for.
 _UNCLEAR = (
     Result.GRAZING,
     Result.EVENT_ORDER,

@@ -1,5 +1,11 @@
 """Continuation of a limit cycle in a parameter, by pseudo-arclength.
 
+`continuation` is the public function: it follows a branch of cycles in both directions
+(`_Trace.run`), marks bifurcations between points (`_Trace.locate`), and returns a `Branch`. Points
+themselves are computed in `curve.py`, and the reason for an end is found in `branch_ends.py`. A
+branch that jumps to another one has its cause in the length of steps (`_Trace._next`); a
+bifurcation that is missed, in `_Trace.between`.
+
 H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, 1977; Yu. A.
 Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 10 (test functions).
 """
@@ -39,11 +45,11 @@ from .rivals import coincident
 from .verdict import verdict
 
 
-# A step is halved if the tangent turns by more than the angle of this cosine. Nearer to 1: more
-# points than a plot needs. Smaller: the branch jumps over turns.
+# A step is halved if the cosine of the angle between successive tangents is below this. Nearer to
+# 1: more points than a plot needs. Smaller: the branch jumps over sharp bends.
 _STRAIGHT = 0.97
-# Parts of a step by which a test function is evaluated beside a point where Newton's method fails,
-# as it does at a crossing of two branches.
+# At a crossing of two branches Newton's method fails. A test function is then evaluated at a point
+# nearby, at these distances (as parts of the step).
 _ASIDE = (0.0, 1e-6, -1e-6, 1e-4, -1e-4, 1e-2, -1e-2)
 # The shortest step, relative to the longest. Longer: the branch ends far from a grazing. Shorter:
 # its end takes more time.
@@ -64,7 +70,7 @@ class BranchPoint(NamedTuple):
     value: float
     """The value of the parameter."""
     multipliers: Complex[np.ndarray, " r"]
-    """The critical ones among them lie on the unit circle to rounding."""
+    """All multipliers of the cycle. The critical ones lie on the unit circle up to rounding."""
 
     @property
     def critical(self) -> Complex[np.ndarray, " c"]:
@@ -110,7 +116,8 @@ class Branch(Showable, eqx.Module):
 
     @remembered
     def _each(self) -> tuple[LimitCycle, ...]:
-        """The cycles, the same objects at each call: they remember what was computed of them."""
+        """The cycles. Each call returns the same objects, which remember what was computed from
+        them."""
         return tuple(self.cycles[k] for k in range(len(self)))
 
     @remembered
@@ -129,7 +136,7 @@ class Branch(Showable, eqx.Module):
         """True for each stable cycle. At a marked point itself rounding decides."""
         if self.cycles.conserved:
             return np.array([cycle.stable for cycle in self._each])
-        # (All at once: rounding of the product touches small multipliers only.)
+        # (By the product of the factors: its rounding errors are small compared to 1.)
         return (np.abs(self.cycles.multipliers) < 1).all(axis=1)
 
     def largest(self, output: str) -> Float[np.ndarray, " K"]:
@@ -252,8 +259,9 @@ def continuation(
 
 
 def _at_event(cycle: LimitCycle) -> LimitCycle:
-    """The cycle with the state after its first event as the beginning, if its section is the plane
-    through a guess: other cycles of the branch may not cross that plane."""
+    """Let a cycle begin at an event, if its section is the default plane through a guess. (Other
+    cycles of the branch may not cross this plane.) Cycles with another section are returned as they
+    are."""
     if not is_default(cycle.base) or not cycle.event_sequence:
         return cycle
     events = cycle.trajectory().events
@@ -278,7 +286,8 @@ def _at_event(cycle: LimitCycle) -> LimitCycle:
 def _branch(
     curve: Curve, points: list[Point], start: int, ends: tuple[BranchEnd, BranchEnd]
 ) -> Branch:
-    """The branch through some points. It ends before points whose verdict has a fault.
+    """The branch through some points. The branch ends before the first point whose verdict has a
+    fault.
 
     **Arguments:** `start`: the index of the first cycle.
     """
@@ -312,8 +321,8 @@ def _branch(
 
 
 def _refused(value: float, point: Point, cycle: LimitCycle) -> BranchEnd:
-    """The end of a branch before the cycle of a point that its checks refuse."""
-    # (That one has no period.)
+    """The end of a branch before a point whose cycle has failed its checks."""
+    # (A cycle that failed its checks has no period of its own.)
     cycle = dataclasses.replace(cycle, period=point.turn.period)
     texts = [finding.text for finding in verdict(cycle).refused]
     result = Result(int(cycle.result))
@@ -322,7 +331,8 @@ def _refused(value: float, point: Point, cycle: LimitCycle) -> BranchEnd:
 
 def _explained(cycle: LimitCycle, end: BranchEnd) -> BranchEnd:
     """The end of a branch after a cycle, with its cause."""
-    # (Linearizations fail near a grazing, and a cycle that is only rounding closes after any time.)
+    # (These two results have a simple cause near the end of a branch: near a grazing linearizations
+    # fail, and a cycle that has shrunk to a point closes after any time.)
     if end.result in (Result.NOT_VERIFIED, Result.EXTRA_TURNS):
         cause = explained(cycle, Result.NOT_CONVERGED)
         known = cause.message != Result.NOT_CONVERGED.message
@@ -349,7 +359,8 @@ def _check(cycle, values) -> np.ndarray:
 
 
 class _Trace(NamedTuple):
-    """A curve between the least and the largest of some values, in steps."""
+    """The curve of cycles, followed step by step between the least and the largest of the given
+    parameter values."""
 
     curve: Curve
     values: np.ndarray
@@ -357,7 +368,8 @@ class _Trace(NamedTuple):
     max_points: int
 
     def run(self, start: Point) -> tuple[list[Point], BranchEnd]:
-        """The points along a tangent, those of changes of stability among them, and the end."""
+        """The points of the branch from `start` on, including those at changes of stability, and
+        the end of the branch."""
         points = [start]
         length = self.step
         before: Point | None = None
@@ -395,7 +407,8 @@ class _Trace(NamedTuple):
     def _next(
         self, before: Point | None, last: Point, length: float
     ) -> tuple[Point | Result, bool]:
-        """The next point, or why there is none, and whether the values end with it."""
+        """The next point, or the `Result` code that says why there is none; and whether the range
+        of values ends there."""
         low = self.values[0]
         high = self.values[-1]
         point = self.curve.step(before, last, length)
@@ -411,7 +424,7 @@ class _Trace(NamedTuple):
         return point, over
 
     def between(self, a: Point, b: Point) -> list[Point]:
-        """Changes of stability and values after a point until its neighbor, which comes last."""
+        """The points at changes of stability and at wanted values between a and b; b comes last."""
         marked: dict[tuple[float, str], Point] = {}
         for kind, before in a.tests.items():
             after = b.tests[kind]
@@ -443,14 +456,15 @@ class _Trace(NamedTuple):
         return points
 
     def locate(self, a: Point, b: Point, kind: str | int) -> tuple[float, Point] | None:
-        """The zero of a test function between two points, and its part of the distance.
+        """The point between a and b at which a test function is zero, with its distance from a as a
+        part of the distance from a to b.
 
-        On the crossing of two branches itself no point can be computed, but beside it.
+        At a crossing of two branches no point can be computed; a point nearby is returned.
         """
         from scipy.optimize import brentq  # (a third of a second)
 
         points = {0.0: a, 1.0: b}
-        beside: set[float] = set()  # where only a point beside could be computed
+        beside: set[float] = set()  # (only a point nearby could be computed)
 
         def compute(where: float) -> None:
             for aside in _ASIDE:

@@ -1,4 +1,12 @@
-"""Checks of a system's clock and of conserved quantities; the reasons of a search that failed."""
+"""Checks of what users state about a system (clock, symmetry, conserved quantities, outputs), and
+the texts that explain why a search for a limit cycle failed.
+
+`check_claims`, `check_clock` and `check_outputs` are called before and after searches: they compare
+a function of the user with the same function one period later, or at the mirrored state, and raise
+`DefinitionError` if the two differ. `explain` is called by `find.py` with the last *turn* of a
+search that failed (the flow from the section back to it), and returns the sentences of the error.
+*Sizes* of states are their characteristic magnitudes (`scale.py`).
+"""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -32,24 +40,25 @@ from .scale import ROUNDING, STIFF, fastest, is_implicit, points
 from .verdict import verdict
 
 
-# The time at which functions are compared with those a period later, in parts of the period after
-# each point: fields that jump with a clock do not jump there.
+# Functions are compared with those one period later at times this part of the period after each
+# point, where fields that jump with a clock do not jump.
 _BASE = 0.0729
-# Times of a period at which functions are compared that may have pulses. Fewer: short pulses of
-# another period are missed. More: time.
+# Number of times within a period at which functions that may have pulses are compared. Fewer: short
+# pulses of another period are missed. More: time.
 _TIMES = 1024
 
 
-# The distance, in sizes of the states, beyond which a turn does not nearly close. Smaller: searches
-# that have come close are told that there is no cycle. Larger: those that found none are not.
+# A turn nearly closes if its ends are closer than this, in sizes of the states. Smaller: the
+# message says that there is no cycle although the search came close. Larger: the message does not
+# say so although there is none.
 _FAR = 1e-2
 
 
 def check_periodic(system: HybridSystem) -> None:
-    """Check a system of which limit cycles are wanted.
+    """Check a system before a search for its limit cycle.
 
-    **Raises:** `DefinitionError` for one that is not well formed, or uses the time although it
-    states no period.
+    **Raises:** `DefinitionError` for a system that is not well formed, or that uses the time
+    although it states no period.
     """
     clocked = check_system(system)
     if clocked and system.period() is None:
@@ -57,7 +66,8 @@ def check_periodic(system: HybridSystem) -> None:
 
 
 def check_clock(s: Structure) -> None:
-    """**Raises:** `DefinitionError` for a clock that is none, or schedules that do not fit it."""
+    """**Raises:** `DefinitionError` for a clock without a positive period, or schedules that do not
+    fit the clock."""
     given: Any = s.system.period()
     if given is not None and np.shape(given):
         raise DefinitionError(f"`period()` must return one number, not {given}.")
@@ -105,7 +115,7 @@ def check_claims(
         rows = np.flatnonzero(chart == a)
         of_states = np.asarray(scale)[a, :n]
         sizes = np.concatenate([[time], of_states])
-        # (As many times of one period in all as show pulses.)
+        # (With pulses, all points together have `_TIMES` times.)
         every = -(-_TIMES // len(rows)) if may_be_sudden(s, a, _all) else 1
         parts = _BASE + np.arange(every) / every
         times = t[rows, None] + time * parts
@@ -131,8 +141,8 @@ def default_outputs(s: Structure) -> tuple[str, ...]:
 def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
     """Outputs of a cycle that are given to a call.
 
-    **Raises:** `DefinitionError` for one that does not exist, or is not well formed; and for an
-    `Output` that does not have the period of the clock, or depends on time without one.
+    **Raises:** `DefinitionError` for an output that does not exist or is not well formed; for an
+    `Output` that does not have the period of the clock, or depends on time without a clock.
     """
     s = cycle.structure
     z = s.resolve_outputs(outputs)
@@ -349,8 +359,8 @@ def check_conserved(cycle: LimitCycle) -> None:
 
 
 def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, float]:
-    """The outputs that are conserved near the cycle, with their values: their gradients are left
-    eigenvectors of the monodromy."""
+    """The named outputs that are conserved near the cycle, with their values. (The gradient of a
+    conserved output is a left eigenvector of the monodromy matrix.)"""
     cycle = to_host(cycle)
     map = cycle.return_map
     values, gradients = map.outputs(cycle.anchor.q[:, 0], names)
@@ -363,7 +373,8 @@ def _conserved_outputs(cycle: LimitCycle, names: tuple[str, ...]) -> dict[str, f
 
 
 def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> str:
-    """The reason why a search failed that expected this period and has settled, with advice."""
+    """The reason why a search failed, with advice. `expected`: period that the search expected.
+    `settle`: time for which it had simulated before."""
     code = Result(int(cycle.result))
     about_orbit = _about_orbit(cycle, code, turn)
     if about_orbit:
@@ -387,7 +398,8 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
 
 
 def _about_orbit(cycle: LimitCycle, code: Result, turn: Turn) -> str:
-    """The reason why the orbit that a search ended on is no cycle to work with; empty for none."""
+    """If a search ended on an orbit that is no isolated cycle, the reason; otherwise an empty
+    text."""
     map = cycle.return_map
     if code == Result.EVENT_ORDER and map.event >= 0:
         follows = int(map.followed(turn.end))
@@ -464,7 +476,7 @@ def _why_not_converged(cycle: LimitCycle, turn: Turn) -> str:
 
 
 def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -> str:
-    """The place where steps shrank to nothing, or the mode that keeps them short."""
+    """The place where steps became too short, or the rate of the mode that keeps steps short."""
     if int(turn.result) == Result.STEP_COLLAPSE:
         lanes = turn.pieces
         a = int(lanes.chart[0])
@@ -492,8 +504,8 @@ def _about_steps(s: Structure, cycle: LimitCycle, turn: Turn, expected: float) -
 
 
 def rate_of_short_steps(s: Structure, turn: Turn, expected: float) -> float:
-    """The rate of the mode because of which a turn has reached the limit on steps of explicit
-    methods; 0 for none."""
+    """The rate of the fast mode that made a turn reach the limit on steps of explicit methods; 0 if
+    there is no such mode."""
     if int(turn.result) != Result.STEP_LIMIT:
         return 0.0
     rate = 0.0
@@ -515,7 +527,7 @@ def _about_decisions(s: Structure) -> str:
 
 
 def _about_guards(s: Structure, turn: Turn, better: str) -> str:
-    """The values of the guards, if none of them led to an event."""
+    """A sentence with the values of the guards, if no guard led to an event."""
     if turn.events or not s.transitions:
         return ""
     values: dict[int, list[float]] = {}

@@ -1,10 +1,15 @@
-"""Events that coincide on a limit cycle, and the effect of each of their orders on its neighbors.
+"""Events that coincide on a limit cycle: do all orders in which they may happen have the same
+effect?
 
-If two guards are crossed at the same time, neighbors of the cycle reach one or the other first.
-The flow is then piecewise differentiable, with one derivative for each order (S. A. Burden, S. S.
-Sastry, D. E. Koditschek, S. Revzen, Event-selected vector field discontinuities yield
-piecewise-differentiable flows, SIAM J. Applied Dynamical Systems 15, 2016). If these are equal, as
-for events that are independent of each other, it is differentiable.
+If two guards are crossed at the same time, some neighboring trajectories reach one of them first,
+and some the other. The flow is then piecewise differentiable, with one derivative for each order
+(S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen, Event-selected vector field
+discontinuities yield piecewise-differentiable flows, SIAM J. Applied Dynamical Systems 15, 2016).
+If these derivatives are equal, as for events that do not influence each other, the events
+*commute*, and the flow is differentiable.
+
+`find.py`, `limit_cycles.py` and `flow.py` call `commutes` or `groups_on`. Coinciding events are
+found by `_coincidence`, and every order of them is computed by `_orders`.
 """
 
 import itertools
@@ -32,12 +37,12 @@ from .return_map import ReturnMap
 from .rivals import is_due
 
 
-# Two results of the flow are the same up to this relative difference: states and derivatives after
-# events in two orders, functions at two times, the period and the durations between sections.
-# Smaller: errors of the flow count as differences. Larger: small differences pass.
+# Relative difference up to which two results count as the same: states and derivatives after events
+# in two orders, functions at two times, the period and the durations between sections. Smaller:
+# errors of the flow count as differences. Larger: small differences pass.
 SAME = 1e-6
-# Events at one time of which all orders are compared. More: seven events have 5040 orders, which
-# take ten seconds, and each further one takes ten times as long. Fewer: more groups are refused.
+# Number of events at one time up to which all orders are compared. More: the 5040 orders of seven
+# events take ten seconds, and each further event ten times as long. Fewer: more groups are refused.
 _MOST_ORDERED = 6
 
 
@@ -46,16 +51,16 @@ class SimultaneousEvents(NamedTuple):
 
     time: float
     orders: tuple[tuple[str, ...], ...]
-    """The names of the events, in every order in which they can happen. (One may not happen in some
-    order, if the reset of another puts its guard away from zero.)"""
+    """The names of the events, in every order in which they can happen. (In some orders an event
+    may be missing: the reset of another event has moved its guard away from zero.)"""
     derivatives: tuple[Float[np.ndarray, "m n"], ...]
-    """For each order, the derivative of the state after all events with respect to the state
-    before them, at the same time (a product of saltation matrices). It holds for neighbors of the
-    cycle that reach the events in this order."""
+    """For each order, the derivative of the state after all events by the state before all events,
+    at the same time (a product of saltation matrices). It holds for neighbors of the cycle that
+    reach the events in this order."""
     commute: bool
-    """Whether all orders lead through as many events to the same state, with the same
-    derivative. Orders of more than six events are not compared: `orders` then has the one of the
-    cycle, `derivatives` none, and `commute` is False."""
+    """Whether all orders have the same number of events, and lead to the same state with the same
+    derivative. Orders of more than six events are not compared: `orders` then has only the order on
+    the cycle, `derivatives` is empty, and `commute` is False."""
 
 
 class _Order(NamedTuple):
@@ -71,13 +76,13 @@ def simultaneous_events(cycle: Any) -> list[SimultaneousEvents]:
 
 
 def _groups(cycle: Any) -> list[SimultaneousEvents | None]:
-    """The groups of events that happen at the same time; `None` for one whose order is the same for
-    all neighbors of the cycle."""
+    """The groups of events that happen at the same time; `None` for a group whose order is the same
+    on all neighboring trajectories."""
     cycle = to_host(cycle)
     if cycle.result != Result.SIMULTANEOUS:
         cycle.require_found()
-    # (A little more than one turn, for events at its end. Rounding may spoil another one, where
-    # events coincide.)
+    # (A little more than one period, for events at its end; a second period may fail by rounding
+    # where events coincide.)
     path = cycle.trajectory(1.01)
     period = float(cycle.period)
     rows = np.flatnonzero(path.event >= 0)
@@ -94,8 +99,9 @@ def groups_on(
     period: float,
     scale: Float[np.ndarray, "A d"],
 ) -> list[SimultaneousEvents | None]:
-    """The groups of events in these rows of a path that happen at the same time, for times that are
-    compared in parts of a `period`; `None` for one whose order is the same for all neighbors.
+    """The groups of events of a path that happen at the same time; `None` for a group whose order
+    is the same on all neighboring trajectories. `rows`: rows of the path at which events happen.
+    `period`: time relative to which differences of times are judged.
 
     **Arguments:** `scale`: sizes of the states by chart.
     """
@@ -157,8 +163,9 @@ def _coincidence(
 
 
 def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
-    """True if event k + 1 of a path follows event k in all neighbors, at once: both are scheduled,
-    or the reset of event k puts the guard of the next one beyond zero, or at zero in each neighbor.
+    """True if event k + 1 of a path follows event k at once on all neighboring trajectories. This
+    is so if both are scheduled, or if the reset of event k puts the guard of the next event below
+    zero, or to zero on each of them.
     """
     s = path.structure
     g, later = path.event[k : k + 2].tolist()
@@ -185,22 +192,22 @@ def _follows_at_once(path: Trajectory, k: int, period: float) -> bool:
     rate = by_t + by_q @ field
     if value < -TOGETHER * period * abs(rate):
         return True
-    # The guard after the reset, by the time, the state before it and the inputs: zero up to
-    # rounding, if it is zero in each neighbor.
+    # Derivatives of the guard after the reset by the time, the state before it and the inputs. They
+    # are zero up to rounding if the guard is zero on each neighboring trajectory.
     expanded = kernels.reset(s, s.member(g), time, before, u)
     by_reset = expanded[:, 1:, 0]
     direct = np.concatenate([[by_t], np.zeros(n), by_u])
     change = direct + by_q @ by_reset
     by_rows = np.abs(by_q) @ np.abs(by_reset)
     size = np.abs(direct) + by_rows
-    if is_scheduled:  # (its time is the same in all neighbors)
+    if is_scheduled:  # (its time is the same on all trajectories)
         change[0] = 0.0
     return bool((np.abs(change) <= ROUNDING * size).all())
 
 
 def commutes(cycle: Any) -> bool:
-    """True if the orders of all events that coincide on a cycle commute, or are the same for all
-    of its neighbors; False if no events do."""
+    """True if events coincide on a cycle, and all of them commute or have the same order on all
+    neighboring trajectories. False if no events coincide."""
     groups = _groups(cycle)
     return bool(groups) and all_commute(groups)
 
@@ -211,7 +218,8 @@ def all_commute(groups: list[SimultaneousEvents | None]) -> bool:
 
 
 def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]:
-    """The scheduled events that are due together with a group that contains one of a guard."""
+    """The scheduled events that are due at the time of a group that contains an event of a
+    guard."""
     if all(s.clocks[g] >= 0 for g in group):
         return set()
     happened = {int(s.clocks[g]) for g in group}
@@ -225,8 +233,8 @@ def _missed(s: Structure, group: list[int], t: float, period: float) -> set[int]
 
 
 def _rivals(path: Trajectory, k: int, events: list[int], period: float) -> set[int]:
-    """The guards that fall to zero where event k of a path happens, and are none of these events:
-    those of `Tape.rival`."""
+    """The guards, other than those of `events`, that fall to zero where event k of a path happens
+    (see `Tape.rival`)."""
     s = path.structure
     a = int(path.chart[k - 1])
     n = s.dims[a]
@@ -273,7 +281,8 @@ def _commute(scale: Float[np.ndarray, "A d"], a: int, orders: list[_Order]) -> b
 
 
 def _orders(s: Structure, t: float, before: _Order, due: float) -> Iterator[_Order]:
-    """All orders in which events can happen at once after those before, until none is due."""
+    """Iterate over all orders in which events can happen at one time, after the events in `before`,
+    until no further event is due."""
     a = before.chart
     q = before.state[None]
     u = np.zeros((s.nu, 1))
@@ -316,7 +325,7 @@ def _guards_due(
     u: Float[np.ndarray, "nu 1"],
     due: float,
 ) -> list[int]:
-    """The guards of chart a that are at zero, up to their change in a time `due`, and fall."""
+    """The guards of chart a that fall, and are closer to zero than they move in a time `due`."""
     guards = s.guards(a)
     if not guards:
         return []
@@ -337,7 +346,7 @@ def check_begin(map: ReturnMap) -> None:
     if not (base is None or isinstance(base, AtEvent)):
         return
     guards, rates = jax.device_get(_at_anchor(map))
-    # (At the end of sliding the rate of the guard that began it is zero.)
+    # (At the end of sliding, the guard with which sliding began has the rate zero.)
     due = rates < -TOGETHER * np.abs(rates).max(initial=0.0)
     due &= falls_within(guards, rates, TOGETHER * float(map.expected))
     if base is not None:
@@ -350,7 +359,7 @@ def check_begin(map: ReturnMap) -> None:
 
 
 def about_begin(map: ReturnMap, g: int) -> str:
-    """The reason for which turns cannot begin where event g happens, too."""
+    """A sentence: the section of the return map cannot lie where event g happens, too."""
     name = map.structure.transitions[g].name
     begins = "the beginning of every turn"
     if isinstance(map.base, AtEvent):
@@ -365,5 +374,6 @@ def about_begin(map: ReturnMap, g: int) -> str:
 def _at_anchor(map: ReturnMap):
     """The guards (G,) at the anchor, and their rates."""
     watched = map.watch(map.anchor, until(map.anchor.t))
-    value = watched.value[:-1, 0]
-    return value, watched.rate[:-1, 0]
+    guards = watched.value[:-1, 0]
+    rates = watched.rate[:-1, 0]
+    return guards, rates

@@ -1,9 +1,13 @@
 r"""Harmonic transfer functions in continuous time, and the response of a cycle to lasting changes.
 
 Under an input $e^{i w t}$, deviations from the cycle are $e^{i w t}$ times a function with the
-period of the cycle. It is found from the monodromy matrix and from the forced linear flow over one
-turn; the Fourier integral is a sum over the same nodes, interrupted at events (no truncated series;
-N. M. Wereley, Analysis and control of linear periodically time varying systems, MIT 1991).
+period of the cycle. This function follows from the monodromy matrix and from the forced linear flow
+over one period (`LinearFlow.driven`). Its Fourier integrals are sums over the nodes of the linear
+flow, interrupted at events, so that no series is truncated (N. M. Wereley, Analysis and control of
+linear periodically time varying systems, MIT 1991).
+
+`LimitCycle.htf` calls `continuous_htf`; `_transfer` does the work. A *piece* is a part of the cycle
+between events, with `NODES` nodes.
 """
 
 import functools as ft
@@ -25,19 +29,20 @@ from ..systems.structure import Outputs, Structure
 from ..systems.system import Output, OutputNames
 from .linear_flow import LinearFlow, linear_flow, rule
 from .return_map import ReturnMap
+from .scale import in_sizes
 
 
-# Largest angle by which an input, or a harmonic of the output, turns within a piece. Larger:
-# polynomials on a piece lose digits. Smaller: more pieces than needed.
+# Largest change of the phase angle of an input, or of a harmonic of the output, within a piece, in
+# radians. Larger: polynomials on a piece lose digits. Smaller: more pieces than needed.
 _TURNS = 4.0
-# Distance in cycles per period from a pole on the unit circle at which a frequency lies on it.
-# Smaller: responses are rounding errors. Larger: frequencies beside it are rejected.
+# A frequency counts as a pole if it is closer to a pole than this, in cycles per period. Smaller:
+# responses are rounding errors. Larger: frequencies near a pole are rejected.
 _POLE = 1e-9
-# Chebyshev's frequencies beyond those that sines need, by the cube root of their angle. Fewer:
-# responses lose digits. More: calls take longer.
+# Number of Chebyshev frequencies, in addition to the largest angle, in units of the cube root of
+# this angle. Fewer: responses lose digits. More: calls take longer.
 _EXTRA = 12
-# Pieces times frequencies of one call. More: gigabytes of memory. Fewer: calls are refused that a
-# machine can do.
+# Largest number of pieces times frequencies in one call. More: gigabytes of memory. Fewer: calls
+# that a machine could do are refused.
 _LARGEST = 2**21
 
 
@@ -66,8 +71,8 @@ def linear_outputs(
 
 
 def longest_piece(f: Float[np.ndarray, " F"], harmonics: tuple[int, ...]) -> float:
-    """Length of pieces, in parts of a period, that resolves inputs and outputs: a power of the
-    root of 2, so that calls with similar frequencies share a linearization."""
+    """Length of pieces, as a part of the period, that resolves inputs and outputs. It is a power of
+    the square root of 2, so that calls with similar frequencies share a linearization."""
     of_inputs = 1.25 * np.max(np.abs(f))
     of_outputs = np.max(np.abs(harmonics))
     fastest = max(of_inputs, of_outputs, 0.1)
@@ -120,9 +125,10 @@ def continuous_htf(
 def _interpolation(
     f: Float[np.ndarray, " F"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """f, Chebyshev's frequencies where these are fewer than f, else f again, and the matrix from
-    values there to values at f, of functions of the frequency that are sums of exp(-2 pi i f s), s
-    from 0 to 1.
+    """Frequencies at which the response is computed, and the matrix from values at these to values
+    at f. They are Chebyshev's frequencies if these are fewer than f, otherwise f itself. The
+    interpolation is for functions of the frequency that are sums of exp(-2 pi i f s), s from 0 to
+    1.
     """
     middle = (np.max(f) + np.min(f)) / 2
     half = np.ptp(f) / 2
@@ -142,7 +148,8 @@ def _interpolation(
     def turn(x):
         return np.exp(1j * np.pi * x)
 
-    # Their mean exponent, s = 1/2, is taken out: the others turn half as fast.
+    # The factor with the mean exponent, s = 1/2, is taken out, so that the rest oscillates half as
+    # fast.
     from_coarse = mix * turn(coarse)
     return f, coarse, from_coarse * turn(-f)[:, None]
 
@@ -166,8 +173,8 @@ def _transfer(
     if on_host(whole):
         _require_no_pole(map, f, whole)
 
-    # The input's wave at the nodes of each piece, relative to its beginning. Columns are responses
-    # to inputs, then to states at phase 0.
+    # The input exp(i w t) at the nodes of each piece, relative to the piece's beginning. Columns
+    # are responses to inputs, then to states at phase 0.
     phase = flow.length[:, None] * rule().nodes / map.expected
     rates = 2j * np.pi * coarse
     inside = xp.exp(phase[..., None] * rates)
@@ -180,10 +187,10 @@ def _transfer(
     at_f = at_f.reshape(len(f), rows + d, -1)
     H, end = xp.split(at_f, [rows], axis=1)
 
-    # The deviation at phase 0 is that one period later.
+    # In the periodic response, the deviation at phase 0 is the same one period later.
     size = map.sizes
     column = size[:, None]
-    scaled = whole * size / column
+    scaled = in_sizes(whole, size)
     back_a_period = xp.exp(-2j * np.pi * f)[:, None, None]
     turned = xp.eye(d) - back_a_period * scaled
     right = end[..., :nu] / column
@@ -201,9 +208,9 @@ def _require_no_pole(
     monodromy: Float[np.ndarray, "d d"],
 ) -> None:
     """**Raises:** `DefinitionError` for a frequency at which the HTF is infinite."""
-    turns = np.exp(2j * np.pi * f)
+    phasors = np.exp(2j * np.pi * f)
     multipliers = np.linalg.eigvals(monodromy)
-    apart = np.abs(turns[:, None] - multipliers).min(axis=1)
+    apart = np.abs(phasors[:, None] - multipliers).min(axis=1)
     if (apart < _POLE).any():
         where = "every whole number" if map.base else "its multipliers of modulus 1"
         raise DefinitionError(
@@ -237,7 +244,7 @@ def _integrals(
     weighted = waves * flow.length[:, None] * rule().weights
     back = xp.conj(inside)
 
-    # By deviations where pieces begin.
+    # Outputs by the deviations at the beginnings of pieces.
     by_begin, _ = flow.forward
     free = xp.einsum("mpk,pkya->pmyak", weighted, by_state @ by_begin)
     free = free.reshape(P, -1, K) @ back
@@ -247,7 +254,7 @@ def _integrals(
     begins = by_line.reshape(-1, P * d, nu + d)
     of_begin = free @ begins
 
-    # By inputs within pieces.
+    # Outputs by the inputs within pieces.
     pushed = by_state @ flow.pushed.reshape(P, K, d, -1)
     pushed = pushed.reshape(*by_input.shape, K)
     unit = xp.eye(K)[:, None, None]

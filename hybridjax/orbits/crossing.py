@@ -1,4 +1,11 @@
-"""Single sections: the level set of a function, and the state after an event."""
+"""Single sections: the level set of a function (`Crossing`), and the state right after an event
+(`AtEvent`).
+
+Users make them and give them to `find_limit_cycle`, `flow` and families of sections. `to_section`
+turns one into the `Target` at which the engine ends a flow. The *level* of a crossing is a function
+that falls through zero at the section: if a section is crossed in the wrong direction, look at
+`Crossing.level`.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -89,7 +96,7 @@ class Crossing(Definition):
         list(check_output(s, output, "section"))
 
     def in_chart(self, s: Structure, a: int) -> bool:
-        """True if it can be crossed in chart a."""
+        """True if the section can be crossed in chart a."""
         if self.charts is not None and s.names[a] not in self.charts:
             return False
         if isinstance(self.signal, str | Output):
@@ -99,7 +106,7 @@ class Crossing(Definition):
     def level(
         self, s: Structure, a: int, t: Float[Array, ""], q: Float[Array, " n"]
     ) -> Float[Array, ""]:
-        """The level of one state of chart a: it falls through zero at the section."""
+        """The level at one state of chart a, which falls through zero at the section."""
         if isinstance(self.signal, str | Output):
             no_input = jnp.zeros(s.nu)
             value = s.resolve_outputs(self.signal)(a, t, q, no_input)[0]

@@ -1,8 +1,10 @@
-"""The curve P(q; p) = q in the space of states and one parameter, point by point.
+"""The curve P(q; p) = q in the space of states q and one parameter p, point by point. P is the
+return map.
 
 `Curve.step` predicts the next point along the tangent, and `Curve._correct` finds it by Newton's
 method; `branches.py` chooses the lengths of steps and looks for bifurcations between points. A
-branch that ends too early has its cause in `_correct`, whose reason is the `Result`.
+branch that ends too early has its cause in `_correct`, whose reason is the `Result`. A *turn* is
+one application of the return map; *sizes* of states are their magnitudes (`scale.py`).
 """
 
 import dataclasses
@@ -27,16 +29,17 @@ from .return_map import ENOUGH, ReturnMap, Turn, turn_product
 from .shooting import newton_steps
 
 
-# Newton's method ends with a step this small, in sizes of the states; below `_ROUNDING`, rounding
-# errors may be all that is left. Smaller: it does not end. Larger: points are less accurate.
+# Newton's method ends with a step below this, in sizes of the states; or with a step below
+# `_ROUNDING` that does not become smaller, which may be a rounding error. Smaller: it does not end.
+# Larger: points are less accurate.
 _SMALL = 1e-11
 _ROUNDING = 1e-8
-# The least range over the cycle that counts, in sizes of the states. Smaller: states that hardly
-# move shorten the steps. Larger: steps are longer than the orbit.
+# States are scaled by their range over the cycle, but at least by this part of their size. Smaller:
+# states that hardly move shorten the steps. Larger: steps are longer than the orbit.
 _LEAST_RANGE = 0.02
-# A cycle without events is an equilibrium from this part of the range of the first cycle on.
-# Smaller: rounding errors, relative to the cycle, turn the branch around near a Hopf point (a
-# fold), and are seen in its multipliers. Larger: the branch ends before the Hopf point.
+# A cycle without events counts as an equilibrium if its range is below this part of the range of
+# the first cycle. Smaller: near a Hopf point, rounding errors look like a fold, and spoil the
+# multipliers. Larger: the branch ends before the Hopf point.
 _SHRUNK = 1e-3
 
 
@@ -50,9 +53,9 @@ class Point:
     """A cycle on the curve.
 
     **Fields:** `anchor`, chart and phase (as the time of the first cycle's clock) at which it
-    begins; `z` (n,), state (padded) and parameter; `size` (n,), what counts as 1 in each; `tangent`
-    (n,) of the curve, a unit vector in these sizes; `turn` from there, with derivatives with
-    respect to `z`; `steps` of Newton; `kind` of a change of stability there.
+    begins; `z` (n,), state (padded) and parameter; `size` (n,), the unit of each entry of `z`;
+    `tangent` (n,) of the curve, a unit vector in these sizes; `turn` from there, with derivatives
+    with respect to `z`; `steps` of Newton; `kind` of a change of stability there.
     """
 
     anchor: Lanes
@@ -65,7 +68,7 @@ class Point:
 
     @property
     def departure(self) -> Lanes:
-        """The lane at which it begins."""
+        """The lane at which the cycle begins."""
         return jax.tree_util.tree_map(lambda x: x[..., :1], self.turn.pieces)
 
     @property
@@ -98,7 +101,7 @@ class Point:
 
     @property
     def scaled(self) -> Float[np.ndarray, "d n"]:
-        """Derivatives of the residual, all in sizes."""
+        """Derivatives of the residual by state and parameter, in units of `size`."""
         by_column = self.turn.jacobian * self.size
         return by_column / self.size[:-1, None]
 
@@ -111,8 +114,8 @@ class Point:
 
     @ft.cached_property
     def tests(self) -> dict[str | int, float]:
-        """Functions that change their signs when a multiplier crosses the unit circle: two by
-        names, and moduli less 1, which show each of several that cross together."""
+        """Functions that change sign when a multiplier crosses the unit circle: two by name, and
+        the moduli of all multipliers less 1, by index."""
         rows = np.vstack([self.scaled, self.tangent])
         return {
             "fold": float(self.tangent[-1]),
@@ -129,7 +132,7 @@ class Curve:
         self.parameter = parameter
         self.span = span
         map = to_host(cycle.return_map)
-        # (As many steps as single searches take where the usual limit is reached.)
+        # (The limit on steps is the larger one of single searches.)
         steps = max(map.settings.max_steps, ENOUGH)
         settings = dataclasses.replace(map.settings, max_steps=steps)
         self.map = dataclasses.replace(map, settings=settings)
@@ -153,8 +156,8 @@ class Curve:
         return self._correct(z, self._by_value(size), size, self._by_value(), begin)
 
     def step(self, before: Point | None, last: Point, length: float) -> Point | Result:
-        """The next point, about `length` further along the tangent. `before`: the point a step
-        before the last one, if any."""
+        """The next point, about `length` further along the tangent. `before`: the point before the
+        last one, if there is one."""
         ahead = length * last.tangent * last.size
         row = last.tangent / last.size
         guess = last.z + ahead
@@ -174,7 +177,8 @@ class Curve:
         return point if astray <= 0.5 * length else Result.NOT_CONVERGED
 
     def between(self, a: Point, b: Point, where: float) -> Point | Result:
-        """The point over a place on the chord from a to b."""
+        """The point of the curve nearest to a point on the chord from a to b; `where` is the part
+        of the chord."""
         chord = (b.z - a.z) / a.size
         row = chord / np.linalg.norm(chord) / a.size
         z = a.z + where * (b.z - a.z)
@@ -197,8 +201,8 @@ class Curve:
     def elsewhere(self, point: Point) -> Point | None:
         """The same cycle, anchored at a phase of the clock that is far from all events.
 
-        An event that moves across the phase at which the cycle begins changes the chart there, and
-        is no obstacle to the cycle.
+        (If an event moves across the phase at which the cycle begins, Newton's method fails
+        although the cycle exists.)
         """
         pieces = point.turn.pieces
         tapes = point.turn.tapes
@@ -222,7 +226,7 @@ class Curve:
     def _by_value(
         self, size: float | Float[np.ndarray, " n"] = 1.0
     ) -> Float[np.ndarray, " n"]:
-        """The derivative of the parameter with respect to z, in sizes."""
+        """A row vector whose product with z (in units of `size`) is the parameter."""
         return np.append(np.zeros(self.map.structure.d), 1.0) / size
 
     def _correct(
@@ -267,7 +271,8 @@ class Curve:
         return Result.NOT_CONVERGED
 
     def turn(self, map: ReturnMap, z: Float[np.ndarray, " n"]) -> Turn:
-        """One turn of the system there, at the same phase of its clock, with derivatives by z."""
+        """One turn from the point z, of the system with the parameter in z, with derivatives by
+        z."""
         varied = Varied(self.system_at(z[-1]), self.parameter)
         with on_the_cpu(), at_ease():
             map = to_host(map.at_phase_of(varied.system))
@@ -295,7 +300,7 @@ class Curve:
         return np.ptp(pieces.q / scale[pieces.chart].T, axis=1)
 
     def _settled(self, point: Point) -> Point | Result:
-        """The point with a tangent, and sizes by the range of each state on the cycle."""
+        """The point with its tangent, and with `size` from the range of each state on the cycle."""
         scale = np.asarray(self.map.scale)
         ranges = self._ranges(point.turn.pieces)
         if self.map.base is not None and np.max(ranges) <= self.least_range:
@@ -309,7 +314,7 @@ class Curve:
         return dataclasses.replace(point, tangent=tangent, turn=self._kept(point.turn))
 
     def _kept(self, turn: Turn) -> Turn:
-        """A turn with its recorded steps; of long branches with what tells its events."""
+        """A turn with its recorded steps. On long branches only the events are kept."""
         assert turn.tapes is not None
         leaves = jax.tree_util.tree_leaves(turn.tapes)
         self.kept_bytes += sum(x.nbytes for x in leaves)
@@ -322,8 +327,8 @@ class Curve:
 def _cubic(
     a: Point, b: Point, row: Float[np.ndarray, " n"], x: float
 ) -> Float[np.ndarray, " n"]:
-    """The polynomial through two points with their tangents, at a part of their distance along the
-    derivative `row`."""
+    """The cubic polynomial through two points with their tangents, evaluated at a part of their
+    distance along `row`."""
     chord = b.z - a.z
 
     def off(p):
@@ -343,8 +348,8 @@ def far_from_events(t: np.ndarray, events: np.ndarray, period: float) -> int:
 
 
 def away_from_events(cycle: LimitCycle) -> LimitCycle:
-    """A guess for neighbors of a clocked cycle, which begins far from all events: one that moves
-    across the phase of the begin changes the chart there."""
+    """The cycle as a guess for similar clocked systems, with a beginning far from all events. (An
+    event that moves across the beginning would change the chart there.)"""
     # (A copy has no recorded turn.)
     cycle = as_found(cycle) if what_changed(cycle.system, cycle.numbers) else cycle
     if not cycle.clocked or what_changed(cycle.system, cycle.numbers):
@@ -358,7 +363,8 @@ def away_from_events(cycle: LimitCycle) -> LimitCycle:
 
 
 def _rotated(sequence: Iterable[int]) -> tuple[int, ...]:
-    """Events of a turn, from the same one on wherever the turn begins."""
+    """Events of a turn in cyclic order, rotated so that the result does not depend on where the
+    turn begins."""
     events = tuple(sequence)
     rotations = [events[k:] + events[:k] for k in range(len(events))]
     return min(rotations, default=())

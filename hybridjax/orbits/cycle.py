@@ -1,9 +1,11 @@
 """Limit cycles: fixed points of the return map, with their multipliers.
 
-`LimitCycle` is what searches return. It holds the numbers of the last turn, and computes all else
-when it is asked for: multipliers here, from `factors` (`fine_factors` where these contract too
-much), and responses, sensitivities, fluctuations and HTFs in files of these names. A wrong cycle
-has its cause in the search (`find.py`, `newton.py`); `findings` are those of `verdict.py`.
+`LimitCycle` is what searches return. It holds the numbers of the last *turn* (the flow once around
+the cycle), cut into *pieces*. All other results are computed at first use: multipliers here, from
+the Jacobians of the pieces (`factors`; or `fine_factors` if a piece contracts too much); responses,
+sensitivities, fluctuations and HTFs in files of these names. *Sizes* of states are their magnitudes
+(`scale.py`). A wrong cycle has its cause in the search (`find.py`, `newton.py`); `findings` are
+those of `verdict.py`.
 """
 
 from collections.abc import Mapping
@@ -55,7 +57,7 @@ from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
 from .linear_flow import hosted, last_turn, linear_flow, recorded_ends, rule
 from .responses import Responses, asymptotic_phase, responses
 from .return_map import ReturnMap
-from .scale import ROUNDING, has_implicit, sizes_of, stiff_charts
+from .scale import ROUNDING, has_implicit, in_sizes, sizes_of, stiff_charts
 from .sensitivity import Sensitivity, sensitivity
 from .verdict import verdict
 
@@ -65,16 +67,16 @@ _trajectories = Memory()
 
 # Codes of searches that end on a cycle.
 _FOUND = Result.OK, Result.SINGULAR
-# A piece of a turn is computed in factors of its own steps if its weakest direction keeps less than
-# this, and these are multiplied as long as their product keeps as much. Larger: more factors, for
-# more cycles. Smaller: small multipliers lose digits.
+# If a factor contracts its weakest direction by more than this, it is replaced by products of
+# Jacobians of single steps, each over as many steps as possible without contracting more than this.
+# Larger: more cycles have many factors. Smaller: small multipliers lose digits.
 WEAKEST = 1e-5
-# Multipliers below this are lost in the errors of implicit steps. Smaller: errors are taken for
-# multipliers. Larger: multipliers that are accurate are given as 0.
+# With implicit methods, multipliers below this are smaller than their errors. Smaller: errors are
+# taken for multipliers. Larger: multipliers that are accurate are given as 0.
 _LEAST_OF_IMPLICIT = 1e-10
 
-# Residuals below this are rounding, whose digits differ between machines. Larger: a print hides how
-# well a cycle closes. Smaller: prints of the same cycle differ.
+# Residuals below this are rounding errors, which differ between machines, and are not printed.
+# Larger: the print hides how well a cycle closes. Smaller: prints of the same cycle differ.
 _ROUNDING = 1e-12
 
 
@@ -151,8 +153,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
             )
 
     def _require_period(self) -> None:
-        """**Raises:** `DefinitionError` for one of many cycles whose search failed: it has no
-        period along which it could be checked."""
+        """**Raises:** `DefinitionError` if the search for a cycle of a sweep failed, so that it has
+        no period."""
         if not np.isfinite(float(self.period)):
             self.require_found()
 
@@ -198,7 +200,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
     @remembered
     def _multipliers(self) -> Complex[np.ndarray, " r"]:
         blocks = self._scaled_factors()
-        # (The weakest direction of an autonomous flow is its own, which was projected out.)
+        # (In an autonomous system the direction of the flow was projected out, and is not counted
+        # as the weakest one.)
         weaker = 0 if self.clocked else 1
         strong = bool(np.isfinite(self.residual)) and any(
             weakest(block, weaker) < WEAKEST for block in blocks
@@ -208,7 +211,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
         values = product_eigenvalues(blocks, rtol=ROUNDING)
         if strong and has_implicit(self.structure):
             values = self._without_lost(values)
-        # Of each conserved quantity one is known.
+        # Each conserved quantity has a multiplier that is known to be 1.
         order = np.argsort(np.abs(values - 1))
         near_one = order[: len(self.conserved)]
         values[near_one] = 1
@@ -232,8 +235,9 @@ class LimitCycle(WithMultipliers, eqx.Module):
     def _without_lost(
         self, values: Complex[np.ndarray, " r"]
     ) -> Complex[np.ndarray, " r"]:
-        """Multipliers with zeros for those that are lost in errors of implicit steps. A single one
-        on a cycle without events follows from the product of all."""
+        """Multipliers, with zeros in place of those that are lost in errors of implicit steps. If
+        only one is lost on a cycle without events, it is computed from the product of all
+        multipliers."""
         lost = np.abs(values) < _LEAST_OF_IMPLICIT
         values = np.where(lost, 0.0, values)
         if lost.sum() == 1 and not self.event_sequence:
@@ -261,8 +265,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         with other steps (at the first access).
 
         A cycle that `find_limit_cycle` returns has passed these checks, so that no finding is
-        "refused". One of a sweep or of a branch was checked at its guards; here it is checked in
-        full.
+        "refused". A cycle of a sweep or of a branch was checked at its guards only; here it is
+        checked in full.
         """
         _require_values(self, "findings")
         self.require_current()
@@ -420,8 +424,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
             the state, or of the input, times the square root of time. Default: none.
         - `guards`: standard deviations of the level of a transition's guard, or of the time of a
             scheduled event, by name. Default: none.
-        - `resets`: standard deviations of states after a transition, by its name and theirs.
-            Default: none.
+        - `resets`: standard deviations of states after a transition, by names of transitions and
+          states. Default: none.
 
         **Raises:** `DefinitionError` for names that do not exist; `ComputationError` for cycles
         that are not stable.
@@ -551,8 +555,8 @@ def what_changed(
     numbers: Mapping[str, Any],
     single: HybridSystem | None = None,
 ) -> str:
-    """A sentence on what of a system has changed since its cycle was found, if anything has; of
-    systems side by side, of which `single` is one."""
+    """A sentence on the parts of a system that have changed since its cycle was found; empty if
+    none has. For systems side by side, `single` is one of them."""
     now = arrays_of(system)
     changed = change_of(system if single is None else single)
     for key in now.keys() | numbers.keys():
@@ -567,7 +571,7 @@ def what_changed(
 
 
 def as_found(cycle: LimitCycle) -> LimitCycle:
-    """The cycle with the numbers for which it was found."""
+    """The cycle with the parameters for which it was found."""
     arrays, static = eqx.partition(cycle.system, eqx.is_array)
     before = [cycle.numbers.get(name, x) for name, x in arrays_of(cycle.system).items()]
     arrays = jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(arrays), before)
@@ -579,14 +583,15 @@ def require_unchanged(
     numbers: Mapping[str, Any],
     single: HybridSystem | None = None,
 ) -> None:
-    """**Raises:** `DefinitionError` if something of the system, or systems, has changed."""
+    """**Raises:** `DefinitionError` if the code or a parameter of the system, or systems, has
+    changed."""
     change = what_changed(system, numbers, single)
     if change:
         raise DefinitionError(f"{change}.")
 
 
 def _differ(x: Any, y: Any) -> bool:
-    # (A parameter alone is traced, if it was replaced inside of a transformation.)
+    # (If a parameter was replaced inside of a transformation, only this parameter is traced.)
     if is_tracer(x) or is_tracer(y):
         return not is_tracer(y)
     if x is y:
@@ -601,8 +606,9 @@ def orbit_picture(
     ]
     | None = None,
 ) -> str:
-    """An SVG for notebooks, in the plane of the first two states that every chart has, or of time
-    and the only one; "" if there is no such state. (`hj.plot.cycle` draws a large figure.)
+    """An SVG for notebooks, in the plane of the first two states that every chart has. If there is
+    only one such state, it is drawn against time; if there is none, the text is empty.
+    (`hj.plot.cycle` draws a large figure.)
 
     **Arguments:** `sections`: times, charts and states at sections, as of `Trajectory.dense`.
     """
@@ -637,10 +643,11 @@ def orbit_picture(
 
 
 def fine_factors(cycle: LimitCycle) -> list[Matrix]:
-    """Jacobians of one turn from the anchor over a few steps of the flow each, in sizes of the
-    states; for an autonomous system on the states modulo the direction of the flow.
+    """Jacobians over one turn from the anchor, each over a few steps of the flow, in sizes of the
+    states. For an autonomous system the direction of the flow is left out.
 
-    A step of an explicit method cannot contract much, so that every multiplier keeps its digits.
+    A single step of an explicit method does not contract much, so that every multiplier keeps its
+    digits.
     """
     map = hosted(cycle).return_map
     structure = map.structure
@@ -652,9 +659,10 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
     for k, (size, basis) in enumerate(frames):
         size_after, basis_after = frames[(k + 1) % len(frames)]
         derivative = by[k, : len(size_after), : len(size)]
-        parts = basis_after.T, derivative * size / size_after[:, None], basis
+        scaled = in_sizes(derivative, size, size_after)
+        parts = basis_after.T, scaled, basis
         factor = np.linalg.multi_dot(parts)
-        # (A zero that comes out as rounding would be a multiplier.)
+        # (Rounding errors in place of a zero would become a multiplier.)
         norms = [np.linalg.norm(x) for x in parts]
         least = np.finfo(float).eps * np.prod(norms)
         factor = np.where(np.abs(factor) > least, factor, 0.0)
@@ -667,8 +675,8 @@ def fine_factors(cycle: LimitCycle) -> list[Matrix]:
 
 
 def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], Matrix]]:
-    """Sizes of the time and the states at the beginning of each move, and a basis of deviations in
-    these sizes: for an autonomous system, across the flow at equal times."""
+    """For the beginning of each move, the sizes of time and states, and a basis of deviations in
+    these sizes. In an autonomous system, the basis is orthogonal to the flow, at equal times."""
     s = map.structure
     u = np.zeros((s.nu, 1))
     fields = slopes(s, moves.t, moves.chart, moves.q, u).T
@@ -690,7 +698,7 @@ def _frames(map: ReturnMap, moves: Any) -> list[tuple[Float[np.ndarray, " m"], M
 
 
 def derived_if_found(cycle: LimitCycle) -> LimitCycle:
-    """A traced cycle whose derivatives are NaN where it is none."""
+    """A traced cycle, with derivatives of NaN if the search has failed."""
     found = jnp.isin(cycle.result, jnp.array(_FOUND))
 
     def numbers(x: LimitCycle):
@@ -710,8 +718,8 @@ def _derived_where(found: Array, numbers: tuple, of_system: tuple) -> tuple:
 
 @_derived_where.defjvp
 def _derived_where_jvp(primals, tangents):
-    """Derivatives by all numbers of the system are NaN where there is no cycle. (A turn that fails
-    stops, so that reverse mode would take NaN of its end for zero at its beginning.)"""
+    """Derivatives by all parameters are NaN if there is no cycle. (A turn that fails stops early,
+    so that reverse mode would give zero instead of NaN.)"""
     found, numbers, _ = primals
     _, by_numbers, by_system = tangents
     factor = jnp.where(found, 1.0, jnp.nan)
@@ -723,7 +731,8 @@ def log_determinant(cycle: LimitCycle) -> float:
     """The logarithm of the determinant of the monodromy of a cycle without events: the divergence
     of the field, integrated over one turn.
 
-    Steps of an implicit method lose a mode that decays within them; this gives its decay.
+    If a mode decays within one step of an implicit method, its multiplier is lost; the determinant
+    contains it.
     """
     flow = linear_flow(cycle)
     divergence = np.trace(flow.by_state, axis1=2, axis2=3)
@@ -731,7 +740,7 @@ def log_determinant(cycle: LimitCycle) -> float:
 
 
 def orbit(cycle: LimitCycle) -> Trajectory:
-    """One turn from the anchor, in the steps by which it is linearized."""
+    """One period from the anchor, in the steps that are also linearized."""
     map = to_host(cycle.return_map)
     _, tape = last_turn(cycle)
 
@@ -746,8 +755,9 @@ def orbit(cycle: LimitCycle) -> Trajectory:
 
 
 def weakest(factor: Matrix, weaker: int = 0) -> float:
-    """The gain of a factor in its weakest direction but for so many `weaker` ones, relative to the
-    gain in its strongest, or to 1 if that is smaller."""
+    """The gain of a factor in its weakest direction, relative to the gain in its strongest
+    direction, or to 1 if that is smaller. `weaker`: number of weakest directions that are left
+    out."""
     singular = np.linalg.svd(factor, compute_uv=False)
     if len(singular) <= weaker:
         return np.inf

@@ -1,14 +1,18 @@
-"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian.
+"""The search for a limit cycle, by Newton's method on the return map with its exact Jacobian:
+`find_limit_cycle`.
 
 `_near_cycle` starts from a known cycle, `_from_guess` from a state. Where Newton's method fails,
 further attempts follow in this order:
 
 1. `newton.search`: another period, and the smaller steps of Levenberg and Marquardt;
 2. `_solution`: another phase of the clock, a plane that the cycle meets once, more steps;
-3. `_judged`: the sizes of the states of the cycle that was found, and its shorter period;
-4. `_found_later`: all of this from where the flow leads after some periods.
+3. `_judged`: the same cycle in the sizes that states have on it, and a shorter period if it closes
+   sooner;
+4. `_found_later`: attempts 1 to 3 from the state to which the flow leads after some periods.
 
-A cycle that is refused or accepted wrongly has its cause in `verdict.py` and `checks.py`.
+A cycle that is refused or accepted wrongly has its cause in `verdict.py` and `checks.py`. A *turn*
+is one application of the return map, and *sizes* of states are their magnitudes, relative to which
+errors are measured (`scale.py`).
 """
 
 import dataclasses
@@ -63,19 +67,20 @@ from .scale import (
 from .verdict import verdict
 
 
-# A cycle is computed again, in the sizes of its states, if a rough size was larger by more than
-# this factor. Larger: errors of the cycle are larger. Smaller: most cycles are computed twice.
+# Sizes are estimated before the cycle is known. If an estimate was too large by more than this
+# factor, the cycle is computed again. Larger: errors of the cycle are larger. Smaller: most cycles
+# are computed twice.
 _OFF = 4.0
-# Periods of the flow after which a search begins again that ended beyond a guard, or in another
-# chart than it began; and after which one begins again that Newton's method may have led astray.
-# Fewer: slow transients remain. More: a vain search takes longer.
+# If a search ends beyond a guard or in another chart, it begins again after the numbers `_LATER` of
+# periods of flow; if Newton's method may have left the neighborhood of the cycle, after `_LATEST`
+# periods. Fewer: slow transients remain. More: a vain search takes longer.
 _LATER = (8, 40)
 _LATEST = 40
 # Periods within which an event is chosen as the section, in place of a plane. Fewer: rare events
 # are missed. More: time.
 _EVENTFUL = 8
-# Results of a search that has found a cycle, on its own or of a family; and of one that Newton's
-# method may have led astray.
+# Results of a search that has found a cycle (an isolated one, or one of a family); and results
+# after which the search begins again from a later state.
 _FOUND = Result.OK, Result.SINGULAR
 _STRAYED = (
     Result.NOT_CONVERGED,
@@ -88,12 +93,12 @@ _STRAYED = (
     Result.STEP_COLLAPSE,
     Result.EXTRA_TURNS,
 )
-# The rough size of a state that does not move is made smaller this many times, if the guess was far
-# from the cycle, until the state is taken to be at rest. More: searches take longer. Fewer: states
+# If the guess was far from the cycle, the estimated size of a state that does not move is reduced
+# this many times. Then the state counts as being at rest. More: searches take longer. Fewer: states
 # of a guess that is more than 1e18 times too large keep their errors.
 _SHRINKS = 3
-# A guess is far from the cycle if a state is so many times larger than on it. Larger: rough sizes
-# of states that move are kept. Smaller: sizes of states at rest are tried in vain.
+# A guess is far from the cycle if a state of the guess is this many times larger than on the cycle.
+# Larger: sizes that are too large are kept. Smaller: searches with states at rest take longer.
 _DISTANT = 1e3
 
 
@@ -236,13 +241,13 @@ class _Request(NamedTuple):
     """A search for a limit cycle that is asked for, with its arguments checked and prepared."""
 
     map: ReturnMap
-    """The return map where the search begins, in rough sizes of the states."""
+    """The return map at which the search begins, with estimated sizes of the states."""
     known: LimitCycle | None
-    """The cycle that is the guess, if a cycle is."""
+    """The cycle, if the guess is a cycle."""
     section: Crossing | AtEvent | None
-    """The section that is given; by default the map has one of its own."""
+    """The section that the user gives; None for the default section."""
     given: Sizes
-    """Sizes of states that are given."""
+    """Sizes of states that the user gives."""
     patient: bool
     """Whether more steps may follow: the user has not limited them."""
     settle: float
@@ -268,7 +273,8 @@ def _sizes_that_are_given(
 
 
 def _check_section(s: Structure, section: Crossing | AtEvent | None) -> None:
-    """**Raises:** `DefinitionError` for a section that does not fit, or of a clocked system."""
+    """**Raises:** `DefinitionError` for a section that does not fit the system, or that is given
+    for a clocked system."""
     if section is None:
         return
     if s.system.period() is not None:
@@ -306,11 +312,12 @@ def _map_near_cycle(
 
 
 def _near_cycle(request: _Request, known: LimitCycle, traced: bool) -> LimitCycle:
-    """The cycle of a system that is similar to that of a known cycle.
+    """The cycle of a system that is similar to the system of a known cycle.
 
-    The recorded itinerary of the known one (its route, see `repeat.py`) leads to it, if it has one:
-    inside of programs (`traced_cycle`), for derivatives outside of them (`derived_cycle`), and for
-    calls that repeat (`repeated_cycle`). Otherwise Newton's method does.
+    If the known cycle has a *route* (its recorded sequence of events and steps, see `repeat.py`),
+    Newton's method follows it without a search. There are three ways: inside of programs
+    (`traced_cycle`), for derivatives outside of them (`derived_cycle`), and for repeated calls
+    (`repeated_cycle`). Without a route, there is a search.
     """
     map = request.map
     if request.section is None and (is_inside_program() or traced):
@@ -336,7 +343,8 @@ def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:
     """The cycle of a traced system near a known cycle, by Newton's method, with derivatives."""
     near = last_turn(known)
     solution = solve(map, True, True, near)
-    # (Of events that coincide on the guess, too, its search has compared the orders.)
+    # (If the events coincide on the guess, too, their orders were compared when the guess was
+    # found.)
     if near is None or not meet(known.return_map, near[1], known.period):
         assert solution.turn.tapes is not None
         together = meet(map, solution.turn.tapes, solution.turn.period)
@@ -392,9 +400,10 @@ def _searched(request: _Request) -> LimitCycle:
 def _found_later(
     request: _Request, map: ReturnMap, failed: LimitCycle
 ) -> tuple[tuple[LimitCycle, Turn] | None, str]:
-    """The cycle, and its turn, that is found from where the flow leads from a guess whose own
-    search has failed (the flow may lead to a stable one, or to one on which events coincide); None
-    for none. A sentence on a flow that fails, for the message."""
+    """Search again from the states to which the flow leads after some periods, where the search
+    from the guess has failed. (The flow may lead to a stable cycle, or to one on which events
+    coincide.) Returns the cycle and its turn, or None; and a sentence for the message if the flow
+    fails."""
     for periods in _times_later(failed, request.known):
         say(f"the same after {periods} periods")
         try:
@@ -412,7 +421,7 @@ def _found_later(
 
 
 def _sizes_hold(map: ReturnMap, cycle: LimitCycle) -> bool:
-    """Test whether the sizes of states are those of a cycle, nearly."""
+    """Test whether the sizes of a return map are close to those of a cycle."""
     rough = sizes_of(map.structure, map.scale)
     own = sizes_on(map.structure, to_host(cycle.pieces), float(cycle.period))
     return all(
@@ -422,8 +431,9 @@ def _sizes_hold(map: ReturnMap, cycle: LimitCycle) -> bool:
 
 
 def _solution(request: _Request) -> tuple[Solution, ReturnMap]:
-    """The end of Newton's method, and the map on which it ended: that of another phase where an
-    event has passed the phase of the guess, or one with more steps."""
+    """The solution of Newton's method, and the return map on which it was found. This is another
+    map than the given one if an event has passed the phase of the guess (another phase is tried),
+    or if more steps are allowed."""
     map = request.map
     known = request.known
     patient = request.patient
@@ -437,7 +447,7 @@ def _solution(request: _Request) -> tuple[Solution, ReturnMap]:
             solution = search(map, patient)
     if is_default(map.base):
         solution, map = _met_once(map, solution)
-    # (Where the end is out of reach even for steps that are 256 times as long, more do not help.)
+    # (If even steps 256 times as long would not reach the end, more steps do not help.)
     reach = float(solution.turn.period) * ENOUGH
     short = patient and int(solution.result) == Result.STEP_LIMIT
     if short and reach > float(map.expected):
@@ -449,8 +459,8 @@ def _solution(request: _Request) -> tuple[Solution, ReturnMap]:
 
 
 def _met_once(map: ReturnMap, solution: Solution) -> tuple[Solution, ReturnMap]:
-    """A solution that closes, but meets a section that nobody has asked for more than once, on a
-    plane that it meets once; or the same solution."""
+    """If a solution meets the default section more than once, the same cycle on a plane that it
+    meets once. Otherwise the solution as it is."""
     several = int(solution.result) == Result.EXTRA_TURNS
     if not several or map.multiplicity > 1 or not solution.turn.closed:
         return solution, map
@@ -476,8 +486,8 @@ def _judged(
     if coincident(map, solution.turn) and not commutes(cycle):
         return _with_result(cycle, Result.SIMULTANEOUS), solution.turn
     checked = verdict(cycle)
-    # (A cycle that runs four times around closes after half of its period, and again after half of
-    # that.)
+    # (A solution that runs four times around the cycle closes after half of its period, and then
+    # again after half of that.)
     while checked.sooner is not None and map.base is not None and map.multiplicity == 1:
         say("Newton's method, with the shorter period at which the cycle closes")
         expected = real(checked.sooner)
@@ -501,14 +511,14 @@ def kept(map: ReturnMap, solution: Solution) -> LimitCycle:
 
 
 def _with_result(cycle: LimitCycle, result: Result) -> LimitCycle:
-    """The cycle with another result, and what is remembered with it."""
+    """The cycle with another result. What is remembered with the cycle is kept."""
     other = dataclasses.replace(cycle, result=jax.device_put(np.int32(result)))
     return remembering(other, cycle)
 
 
 def _is_slow(map: ReturnMap, turn: Turn) -> bool:
-    """Test whether many periods of a flow would take too long: a stiff one, or one that has reached
-    even the larger limit on steps."""
+    """Test whether a flow over many periods would take too long: the system is stiff, or a turn has
+    reached even the larger limit on steps."""
     if int(turn.result) != Result.STEP_LIMIT:
         return False
     stiff = checks.rate_of_short_steps(map.structure, turn, float(map.expected)) > 0
@@ -516,8 +526,8 @@ def _is_slow(map: ReturnMap, turn: Turn) -> bool:
 
 
 def _times_later(cycle: LimitCycle, known: LimitCycle | None) -> tuple[int, ...]:
-    """The periods of the flow after which a search that failed begins again. `known`: the cycle
-    from which it began, if from one."""
+    """The numbers of periods of flow after which a search that failed begins again. `known`: the
+    cycle from which the search began, if it began from a cycle."""
     strays = cycle.result == Result.NOT_CONVERGED and np.isnan(cycle.residual)
     if strays or cycle.result == Result.GUARD_BEYOND:
         return _LATER
@@ -529,8 +539,8 @@ def _times_later(cycle: LimitCycle, known: LimitCycle | None) -> tuple[int, ...]
 def _map_after(
     map: ReturnMap, section: Crossing | AtEvent | None, periods: int, given: Sizes
 ) -> ReturnMap:
-    """The return map at the state to which the flow leads within some periods, in the sizes that
-    states have there. `given`: sizes that users give.
+    """The return map at the state to which the flow leads within some periods, with the sizes of
+    states at that place. `given`: sizes that users give.
 
     **Raises:** `ComputationError` if the flow fails.
     """
@@ -571,10 +581,10 @@ def _find_with_auto(
     first: dict[str, Any],
     each: dict[str, Any],
 ) -> LimitCycle:
-    """The cycle with an implicit method in those charts that are stiff on it.
+    """The cycle, with an implicit method in the charts that are stiff on the cycle.
 
-    **Arguments:** options of `find_limit_cycle`: `first`, of the first search only; `each`, of
-    the search for the faster cycle, too.
+    **Arguments:** `first`: options of `find_limit_cycle` for the first search only. `each`: options
+    for both searches.
     """
     cycle = find_limit_cycle(integrated(system, Radau()), guess, **first, **each)
     explicit = dataclasses.replace(cycle, system=integrated(system, None))
@@ -593,7 +603,8 @@ def _find_with_auto(
 def _in_own_sizes(
     map: ReturnMap, solution: Solution, given: Sizes
 ) -> tuple[ReturnMap, Solution]:
-    """A cycle that was found in rough sizes, in the sizes that states have on it."""
+    """Compute a cycle again that was found with estimated sizes, in the sizes that states have on
+    it."""
     s = map.structure
     at_rest = sizes_of(s, map.scale)
     shrinks_left = _SHRINKS if _is_distant(map, solution) else 0
@@ -601,11 +612,11 @@ def _in_own_sizes(
         turn = solution.turn
         rough = sizes_of(s, map.scale)
         own = sizes_on(s, turn.pieces, float(turn.period))
-        # A state at rest keeps its rough size: on the cycle it has only rounding errors. (If all
-        # are, the rough sizes are those of a guess that is far too large.)
+        # A state at rest keeps its estimated size, since on the cycle it has only rounding errors.
+        # (If all states are at rest, the guess was far too large.)
         moving = {name: x for name, x in own.items() if x > SAME * rough[name]}
         sizes = at_rest | moving if moving else own
-        # The sizes of a distant guess say nothing: states have smaller ones until they move.
+        # The sizes of a distant guess are useless: they are reduced until states move.
         shrinks = shrinks_left > 0 and 0 < len(moving) < len(own)
         if shrinks:
             shrinks_left -= 1
@@ -643,12 +654,13 @@ def _with_sizes(map: ReturnMap, solution: Solution, sizes: Sizes) -> ReturnMap:
 
 
 def _with_distance_in(solution: Solution, map: ReturnMap, fine: ReturnMap) -> Solution:
-    """A solution of one return map, with the distance of its ends in the sizes of another."""
+    """The solution of one return map, with its distance expressed in the sizes of another return
+    map."""
     turn = solution.turn
     residual = np.abs(turn.residual)
     before = to_host(map).sizes
     after = to_host(fine).sizes
-    # (Gaps between moves are part of the distance, too.)
+    # (The distance also contains the gaps between moves.)
     gap = np.asarray(turn.distance) - np.max(residual / before)
     by_gap = gap * np.max(before / after)
     distance = np.max(residual / after) + by_gap

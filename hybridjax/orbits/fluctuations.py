@@ -1,9 +1,15 @@
 r"""Random deviations from a cycle under weak noise, to first order.
 
 Over a piece of the cycle the covariance C of deviations satisfies dC/dt = Df C + C Df^T + B B^T,
-and events multiply it by saltation matrices; it is stationary where it closes over a turn (periodic
-Lyapunov equation; S. Bittanti, P. Colaneri, Periodic systems, Springer 2009). Without a clock the
-phase Z . x diffuses and is taken out: the deviations are those across the cycle at equal phases.
+and events multiply it by saltation matrices; it is stationary if it is the same one period later
+(periodic Lyapunov equation; S. Bittanti, P. Colaneri, Periodic systems, Springer 2009). Without a
+clock the phase Z . x diffuses without bound. It is taken out, so that deviations are those across
+the cycle, at equal phases.
+
+`LimitCycle.fluctuations` calls `fluctuations`, and `_noisy` takes the stages in order: the effect
+of each *piece* of the cycle (a part between events) and of each event (`_pieces`), one period
+(`_around`), the stationary covariance (`_stationary`), and the covariance at the nodes
+(`_within_pieces`). A wrong covariance has its cause in `_pieces`.
 """
 
 from collections.abc import Mapping
@@ -28,9 +34,10 @@ from .return_map import SINGULAR
 from .sensitivity import section_delay
 
 
-# Largest standard deviation, relative to the largest to which the same noise could lead, that is
-# rounding and becomes zero. Smaller: what the noise does not reach gets digits of chance, and roots
-# of negative variances. Larger: noise that reaches a state through a weak coupling alone is lost.
+# A standard deviation below this part of the largest one that the same noise could cause is a
+# rounding error, and becomes zero. Smaller: states that noise does not reach get random digits, or
+# roots of negative variances. Larger: noise that reaches a state through a weak coupling alone is
+# lost.
 _ROUNDING = 1e-12
 
 Strengths = Mapping[str, NonNegative]
@@ -57,16 +64,18 @@ class Fluctuations(Showable, eqx.Module):
     flow: LinearFlow
     period: Float[Array, ""]
     step: Float[Array, "n n"]
-    """From states, the delay of the last event and durations to those one turn later."""
+    """Matrix from states, delay of the last event and durations to the same numbers one period
+    later."""
     joint: Float[Array, "n n"]
-    """Their stationary covariance."""
+    """Stationary covariance of states, delay of the last event and durations."""
     varies: Bool[Array, " E"]
     """Whether the noise reaches each duration."""
     at_nodes: Float[Array, "P K d d"]
     unresolved: Float[Array, ""]
     """The largest difference of covariances at ends of pieces, computed in two ways."""
     to_nodes: Float[Array, "P K d d"]
-    """From deviations at phase 0 to those at the nodes, across the cycle; `to_end` one turn on."""
+    """Matrix from deviations at phase 0 to deviations at the nodes, across the cycle. `to_end`: to
+    deviations at phase 0 one period later."""
     to_end: Float[Array, "P K d d"]
 
     def covariance(self, phase: Phases, lag: Index = 0) -> Float[Array, "p d d"]:
@@ -91,9 +100,9 @@ class Fluctuations(Showable, eqx.Module):
         return self.flow.at(phase, self.period, covariance)[1]
 
     def durations(self, lag: Index = 0) -> Float[Array, "E E"]:
-        """Covariance of the durations that end at the `events` of a turn, each since the event
-        before, with those `lag` turns before. The sum of all entries is the covariance of periods
-        from the last event to the next such event."""
+        """Covariance of durations (from each event to the next one of `events`) with durations
+        `lag` periods before. The sum of all entries is the covariance of periods from the last
+        event to the next such event."""
         n = len(self.joint) - len(self.events)
         xp = namespace(self.joint)
         later = xp.linalg.matrix_power(self.step, lag) @ self.joint
@@ -126,8 +135,8 @@ def fluctuations(
 
 
 class _Pieces(NamedTuple):
-    """The pieces of a turn, each with the event at its end, for vectors of n numbers: the d states,
-    the delay of the last event, and the durations of the turn so far."""
+    """The pieces of one period, each with the event at its end. Matrices act on vectors of n
+    numbers: the d states, the delay of the last event, and the durations of the period so far."""
 
     forward: Float[Array, "P n n"]
     """The effect of the piece."""
@@ -143,13 +152,13 @@ class _Events(NamedTuple):
     """The events at the ends of pieces."""
 
     hit: Bool[Array, " P"]
-    """Whether there is one."""
+    """Whether there is an event."""
     delay: Float[Array, "P d"]
-    """Derivative of its time by the state before it."""
+    """Derivative of the time of the event by the state before it."""
     delay_by_noise: Float[Array, " P"]
-    """Standard deviation of its time by the noise in its own level."""
+    """Standard deviation of the time of the event by the noise in the level of its guard."""
     slot: Bool[Array, "P E"]
-    """Which of the durations ends with it."""
+    """Which of the durations ends with the event."""
 
 
 @one_program
@@ -167,7 +176,7 @@ def _noisy(
     n = pieces.forward.shape[-1]
     d = flow.q.shape[-1]
 
-    # One turn without fluctuations at its beginning.
+    # One period that begins without fluctuations.
     none = xp.zeros((n, n))
     (turn, noise), (begin, *_) = _around(pieces, none)
     valid = xp.append(map.valid, xp.ones(n - d, bool))
@@ -185,7 +194,7 @@ def _noisy(
     noise = across @ noise @ across.T
     joint = _stationary(step, noise, d)
 
-    # One turn with the stationary ones.
+    # One period that begins with the stationary fluctuations.
     _, (_, before_pieces, before_events) = _around(pieces, joint)
     before_events = before_events[:, :d, :d]
     at_nodes = _within_pieces(flow, columns, before_pieces[:, :d, :d])
@@ -226,7 +235,8 @@ def _names_of_events(cycle: Any) -> list[str]:
 
 
 def _events(cycle: Any, flow: LinearFlow, levels: np.ndarray) -> _Events:
-    """The events of a cycle, with the section in place of one for an autonomous cycle without any.
+    """The events of a cycle. For an autonomous cycle without events, its section counts as an
+    event.
 
     `levels`: standard deviations of levels, by index of the transition."""
     map = cycle.return_map
@@ -270,7 +280,8 @@ def _pieces(
     free, _ = flow.forward
     stays = np.arange(n) >= d
     forward = _pad(free[:, -1], n) + np.diag(stays)
-    # An event begins a delay of its own, and ends a duration, from the delay before to its own.
+    # An event begins a new delay and ends a duration: the duration changes by the new delay minus
+    # the delay of the event before.
     none = xp.zeros((P, d, 1 + E))
     each = events.slot[..., None]
     delay = events.delay[:, None]
@@ -293,8 +304,8 @@ def _pieces(
 
 
 def _around(pieces: _Pieces, covariance: Float[Array, "n n"]):
-    """One turn from deviations with this covariance: its derivative and the covariance after it;
-    and these two before each piece, with the covariance before each event."""
+    """One period that begins with this covariance. Returns the derivative and the covariance at the
+    end of the period; then both before each piece, and the covariance before each event."""
 
     def over_piece(carry, piece):
         forward, collected, jump, added = piece
@@ -310,8 +321,8 @@ def _around(pieces: _Pieces, covariance: Float[Array, "n n"]):
 def _diffusion(
     map: Any, phase: Float[Array, " d"], noise: Float[Array, "d d"]
 ) -> Float[Array, ""]:
-    """Growth of the variance of the phase per time. `phase`: its gradient; `noise`: covariance
-    that a turn adds to the states."""
+    """Growth of the variance of the phase per time. `phase`: gradient of the phase; `noise`:
+    covariance that one period adds to the states."""
     xp = namespace(noise)
     spread = phase @ noise @ phase
     reached = spread > _rounding(phase, noise, map.sizes)
@@ -337,7 +348,8 @@ def _stationary(
     lyapunov = np.eye(d * d) - xp.kron(states, states)
     of_states = xp.linalg.solve(lyapunov, noise[:d, :d].ravel())
     joint = _pad(of_states.reshape(d, d), len(step))
-    # Durations follow from the states of this turn and from those of the last one.
+    # Durations depend on the states of this period and of the last one, so that two iterations
+    # suffice.
     for _ in range(2):
         joint = step @ joint @ step.T + noise
     return joint
@@ -372,7 +384,7 @@ def _largest_difference(
     variance = xp.abs(xp.diagonal(at_nodes, axis1=2, axis2=3))
     size = xp.sqrt(xp.max(variance, axis=(0, 1)))
     products = size[:, None] * size
-    # (States that no noise reaches have no size.)
+    # (States that no noise reaches have products of zero.)
     return xp.max(difference / xp.maximum(products, 1e-300))
 
 
@@ -400,7 +412,7 @@ def _varying_durations(
     has_noise = events.delay_by_noise != 0
     varies = events.hit & ((variance > rounding) | has_noise)
     late_ends = xp.any(varies[:, None] & events.slot, axis=0)
-    # A delay of an event counts for the durations before and after it.
+    # The delay of an event changes the durations before and after it.
     return late_ends | xp.roll(late_ends, 1)
 
 
@@ -409,8 +421,8 @@ def _rounding(
     covariance: Float[Array, "d d"],
     sizes: Float[Array, " d"],
 ) -> Float[Array, ""]:
-    """The variance of a function with this gradient that may be rounding: that of the most random
-    state, times the square of the largest derivative, both by sizes."""
+    """The variance of a function with this gradient that may be a rounding error. It is the largest
+    variance of a state times the square of the largest derivative, both in sizes."""
     xp = namespace(covariance)
     steepest = xp.max(xp.abs(gradient) * sizes)
     widest = xp.max(xp.abs(xp.diagonal(covariance)) / sizes**2)

@@ -1,8 +1,8 @@
 """The beginning of a search for a limit cycle: from a guess to a state on the section.
 
 `return_map_near` takes the stages in order: it checks the guess, estimates the magnitudes of the
-states, simulates for `settle`, and, if no clock drives the system, flows to the section and back to
-it (`_on_section`), which gives the period from which Newton's method starts.
+states and simulates for `settle`. If no clock drives the system, it then flows to the section and
+back to it (`_on_section`). The time between gives the first guess of the period.
 """
 
 import dataclasses
@@ -37,29 +37,30 @@ from .checks import check_claims
 from .coincidence import SAME
 from .crossing import AtEvent, Crossing, to_section
 from .return_map import ReturnMap, Turn
-from .scale import Sizes, fastest, scale_of, sizes_near, slow_time
+from .scale import Sizes, fastest, in_sizes, scale_of, sizes_near, slow_time
 
 
 # An autonomous system is given up if it does not return within this multiple of the time scale of
 # the states at the guess. Smaller: slow cycles are lost. Larger: vain searches last longer.
 _PATIENCE = 1000.0
-# A search that would be given up looks so often whether the states have become slower than they
-# were at the guess. Fewer: cycles are lost if the guess lies where they are fast. More: vain
-# searches last longer.
+# Before a search for the section is given up, its patience is extended this many times if the
+# states have become slower than at the guess. Fewer: cycles are lost if the guess lies where the
+# states are fast. More: vain searches last longer.
 _LOOKS = 10
-# On a slow manifold, to which a fast mode has led, it waits this multiple of the time of motion
-# there, if that is longer, and until the next look at most this multiple of the time so far.
-# Smaller: slow manifolds are not left. Larger: vain searches last longer.
+# On a slow manifold, the search waits this multiple of the time scale of the motion there, if that
+# is longer; but each extension is at most this multiple of the time so far. Smaller: the search
+# ends before the slow manifold is left. Larger: vain searches last longer.
 _UNMOVED = 3.0
 _LOOKS_FURTHER = 2.0
-# Steps in which events are counted. More: memory. Fewer: rare events are missed.
+# Number of recorded steps in which events are counted. More: memory. Fewer: rare events are missed.
 _RECORDED = 4096
-# A default section lies so much farther on than the event or the time at which a search for another
-# one ended, as a part of the time after which that is given up. Smaller: it lies at the event.
+# If a default section is missed, the next one is placed a little later than the event or the time
+# at which the flow ended: by this part of the patience. Smaller: the section lies at the event.
 # Larger: time.
 _ONWARD = 3.7e-4
-# States are at rest within this distance of an equilibrium, in sizes. Larger: slow cycles near an
-# equilibrium are taken for it. Smaller: errors of the flow are taken for motion.
+# States are at rest if they are closer to an equilibrium than this, in sizes of the states. Larger:
+# slow cycles near an equilibrium count as being at rest. Smaller: errors of the flow count as
+# motion.
 _REST = 1e-5
 
 
@@ -126,7 +127,7 @@ def _own_guess(system: HybridSystem) -> Guess:
     """
 
     def of_host(x):
-        # (JAX would compile each operation on numbers of its own.)
+        # (By NumPy: JAX would compile a program for each operation.)
         return np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x
 
     guess = jax.tree_util.tree_map(of_host, system).guess()
@@ -165,8 +166,8 @@ def _check_field(s: Structure, guess: Guess, lane: Lanes) -> None:
 
 
 def _settled(map: ReturnMap, settle: float, period: float | None) -> ReturnMap:
-    """The map at the state to which the flow leads in some time; a clocked one after whole periods,
-    at the same time of the clock."""
+    """The return map at the state to which the flow leads in the time `settle`; in a clocked
+    system, after whole periods."""
     say("settling")
     lanes = map.anchor
     wait = settle if period is None else np.ceil(settle / period) * period
@@ -224,10 +225,10 @@ def _on_section(
     """The map of an autonomous system, with its anchor on the section and a rough period.
 
     **Arguments:** `section`; Default: the plane through the anchor, across the flow. `is_after`:
-    whether an event of that name has led to the anchor. `time`, the time scale of the states;
-    `max_period`, the longest time until the section is reached; Default: by the time scales of the
-    states at the anchor and where the search ends. `last`: whether to give up if the default plane
-    is missed; otherwise a plane through the state to which the flow has led is the next.
+    whether the event of the section has just led to the anchor. `time`: time scale of the states.
+    `max_period`: longest time until the section is reached. Default: from the time scales of the
+    states. `last`: whether to give up if the default plane is missed; otherwise the next plane goes
+    through the state at which the flow ended.
     """
     s = map.structure
     at_guess = map
@@ -266,7 +267,7 @@ def _on_section(
         moved, late = _next_crossing(map, section, back, max_period)
         if is_default(section) and _misses(moved) and not last:
             say("a section where the flow has led")
-            # (A search that is given up may end at an event.)
+            # (The flow that missed the section may have ended at an event.)
             longest = _ONWARD * _patience(map, moved.lanes)
             end = np.asarray(moved.lanes.t) + longest
             onward = _go(map, "settling", moved.lanes, toward(end, -1, end))
@@ -306,7 +307,8 @@ def _next_crossing(
     lanes: Lanes,
     max_period: float | None,
 ) -> tuple[Moved, str]:
-    """The flow to the next crossing of a section, and advice if it was given up.
+    """The flow to the next crossing of a section; and advice for the message, if the section was
+    not reached.
 
     **Raises:** `ComputationError` if the flow comes to rest before.
     """
@@ -321,7 +323,7 @@ def _next_crossing(
         waited = end - begin
         if not _misses(moved) or max_period is not None:
             break
-        # (The states may have become slower than they were at the guess, or drift away.)
+        # (The states may have become slower than at the guess, or may drift away.)
         lanes = moved.lanes
         _require_motion(map, lanes)
         unmoved = min(_UNMOVED * _time_of_motion(map, lanes), _LOOKS_FURTHER * waited)
@@ -343,8 +345,8 @@ def _next_crossing(
 
 
 def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
-    """The state right after the event that is rarest within some periods from the anchor on: each
-    turn meets it less often than other sections. `None` without events."""
+    """The state right after the rarest event within some periods from the anchor on, which is the
+    section that a cycle meets least often. `None` without events."""
     s = map.structure
     lanes = to_host(map.anchor)
     end = lanes.t + periods * float(map.expected)
@@ -355,7 +357,7 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
     assert tape is not None
     code = np.asarray(tape.code)[:, 0]
     follows = np.asarray(tape.at_once)[:, 0]
-    # (A section at an event that another one follows at once is refused.)
+    # (An event that another event follows at once cannot be a section.)
     is_followed = np.append(follows[1:], False)
     happens = (code >= 0) & ~is_followed
     if not happens.any():
@@ -372,8 +374,8 @@ def after_rarest_event(map: ReturnMap, periods: int) -> Guess | None:
 
 
 def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
-    """The map of a turn that closes, on a plane that it meets once; `None` if none is found. The
-    planes that are tried lie across the flow where the pieces of the turn begin."""
+    """For a turn that closes, the return map on a plane that the turn meets once; `None` if there
+    is none. Planes are tried across the flow where the pieces of the turn begin."""
     s = map.structure
     tape = side_by_side(to_host(turn.tapes))
     pieces = to_host(turn.pieces)
@@ -396,7 +398,7 @@ def met_once(map: ReturnMap, turn: Turn) -> ReturnMap | None:
         ends_from_point = ends[:n] - point[:, None]
         after = normal @ ends_from_point
         meets = (moves.chart == a) & (before <= 0) & (after >= 0)
-        # (It meets the plane where the piece begins, with the move before and that after.)
+        # (The moves before and after the beginning of the piece meet the plane there.)
         meets[begins[k] - 1 : begins[k] + 1] = False
         if meets.any():
             continue
@@ -420,12 +422,13 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
     sizes = np.maximum(magnitude, scale)
     rate = field[:, 0] / sizes
     by_state = field[:, 2 : 2 + n]
-    jacobian = by_state * sizes / sizes[:, None]
-    # (On a slow manifold rates are small, too, but the equilibrium is far away.)
+    jacobian = in_sizes(by_state, sizes)
+    # (On a slow manifold rates are small, too. Newton's step gives the distance of the equilibrium,
+    # which is large there.)
     distance = np.linalg.lstsq(jacobian, rate)[0]
     if np.any(np.abs(distance) > _REST):
         return
-    # (A state that drifts at a constant rate is near none.)
+    # (A state that drifts at a constant rate is not near an equilibrium.)
     drift = rate - jacobian @ distance
     largest = np.abs(rate).max()
     if np.abs(drift).max() > 0.1 * largest:
@@ -443,7 +446,8 @@ def _require_motion(map: ReturnMap, lanes: Lanes) -> None:
         text = (
             f" It lies beyond the guard of {', '.join(beyond)}, which cannot trigger."
         )
-    # (The equilibrium is known to a part of the sizes: what is less is zero.)
+    # (States of the equilibrium are known up to the part `_REST` of their sizes: smaller values are
+    # zero.)
     known = magnitude > _REST * scale
     place = np.where(known, lane.q[:n, 0], 0.0)
     place = signal_values(s.states(a), place)

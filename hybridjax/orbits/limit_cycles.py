@@ -1,9 +1,12 @@
 """Limit cycles of many systems at once: the points of a parameter sweep side by side.
 
-`solved` divides the work. Many systems first follow the itineraries of known cycles (`many.py`).
-Those that leave them, and all of a small sweep, take Newton steps from cycles of neighbors
-(`batches.py`). `examined` then tests events that coincide, and integrates eight cycles a second
-time (all of them, if one of the eight has a fault).
+`find_limit_cycles` is the public function, and `solved` divides the work. In a large sweep, systems
+first follow the *itineraries* of known cycles, that is, their recorded sequences of steps and
+events (`many.py`). Systems that leave these itineraries, and all systems of a small sweep, are
+solved from the cycles of their neighbors by Newton's method with a search for events
+(`batches.py`). `examined` then tests events that coincide, and checks eight cycles by a second
+integration (all cycles, if one of the eight has a fault). If a cycle of a sweep differs from a
+search for it alone, compare these two ways.
 """
 
 import dataclasses
@@ -47,19 +50,22 @@ from .rivals import coincide_on
 from .verdict import verdict
 
 
-# Cycles that are tested for whether events that coincide commute; all are, if one of these fails.
-# More: the test takes longer. Fewer: exceptions are missed.
+# Number of cycles on which coinciding events are tested for whether they commute; if they do not
+# commute on one of these cycles, all cycles are tested. More: the test takes longer. Fewer:
+# exceptions are missed.
 _LOOKED_AT = 50
-# Systems from which programs of itineraries are worth their compilation. Fewer: a sweep waits for
-# the compiler. More: turns side by side take longer.
+# Number of systems from which on programs that follow itineraries are worth their compilation.
+# Fewer: a sweep waits for the compiler. More: sweeps without such programs take longer.
 WORTH_COMPILING = 250
-# Turns after which a search begins in the chart where they end. More: hopeless searches last
-# longer. Fewer: cycles that begin in another chart are lost.
+# Number of turns (returns to the section) that are simulated before a search, to find the chart in
+# which the cycle begins. More: hopeless searches last longer. Fewer: cycles that begin in another
+# chart are lost.
 _TURNS = 3
-# Cycles from which systems begin that no route suits. More: neighbors take longer to find. Fewer:
-# guesses are worse.
+# Number of known cycles that serve as guesses for systems that follow no itinerary. More: the
+# nearest known cycle takes longer to find. Fewer: guesses are worse.
 _GUESSES = 500
-# Cycles that are tested for jumps and pulses of fields, and checked in full, which takes longer.
+# Number of cycles that are tested for jumps and pulses of fields, and checked in full. More: sweeps
+# take longer.
 _TESTED = 8
 
 
@@ -257,7 +263,7 @@ def solved(
     """The cycles of systems near that of a return map.
 
     **Arguments:** `size`: systems per call. `known`: see `Tiles`. `checked`: whether the cycle of
-    the map has passed its verdict; others are no itinerary for systems.
+    the map has passed its verdict. Only then do other systems follow its itinerary.
     """
     S = len(leaves_of(systems)[0])
     tiles = tiles_of(systems, map, size, workers)._replace(known=known)
@@ -298,8 +304,9 @@ def solved(
 
 
 def _search(map: ReturnMap) -> ReturnMap | None:
-    """The return map of a cycle that is found from the state of a map's anchor; None if there is
-    none. (Newton's method does not lead to a cycle that begins in another chart: turns do.)"""
+    """The return map of the cycle that a search finds from a map's anchor; None if it fails.
+    (Newton's method does not change the chart at the beginning; simulated turns may end in another
+    chart.)"""
     with at_ease():
         for _ in range(_TURNS):
             end = map.turn(map.anchor.q[:, 0]).end
@@ -323,7 +330,7 @@ def _some(systems: HybridSystem, rows) -> HybridSystem:
 
 
 def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCycles:
-    """The cycles that were found on routes; NaN for the others."""
+    """The cycles that were found on itineraries; NaN for the other systems."""
     found = solver.found
     s = map.structure
     S = len(solver.found.path)
@@ -375,7 +382,7 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
 
 
 def _wider(codes: np.ndarray, more: np.ndarray) -> np.ndarray:
-    """Codes of events with those of other rows."""
+    """Codes of events, padded to as many columns as `more` has, if it has more."""
     width = max(codes.shape[1], more.shape[1])
 
     def fill(x):
@@ -476,8 +483,8 @@ _turns = Memory()
 
 
 def keep_turns(cycles: LimitCycles, turns: Sequence[Turn | None]) -> LimitCycles:
-    """Keep the last turns of cycles, from which their trajectories are made. (Without one, a cycle
-    is integrated again.) Returns the cycles."""
+    """Keep the last turns of cycles, from which their trajectories are made, and return the cycles.
+    (A cycle without its last turn is integrated again.)"""
     _turns.recall(cycles, None, lambda: tuple(turns))
     return cycles
 
@@ -487,8 +494,9 @@ def examined(
     together: Bool[np.ndarray, " S"],
     walked: Bool[np.ndarray, " S"] | None = None,
 ) -> LimitCycles:
-    """The cycles, with the result `SIMULTANEOUS` if events coincide that do not commute, and with
-    those of their verdicts: of eight cycles and, if one of these has a fault, of all.
+    """The cycles with their final results: `SIMULTANEOUS` if events coincide that do not commute,
+    and the results of verdicts. Verdicts are computed for eight cycles; if one of these has a
+    fault, for all.
 
     **Arguments:** `together`: whether events coincide. `walked`: cycles that a second integration
     has checked already. Default: none.
@@ -554,7 +562,8 @@ def _stacked(systems) -> HybridSystem:
 
 
 def rough(cycle: LimitCycle) -> dict[str, Any]:
-    """The period and the anchor, in sizes of the states, in digits on which two searches agree."""
+    """The period and the anchor (in sizes of the states), rounded to digits on which two searches
+    agree."""
     chart = int(np.asarray(cycle.anchor.chart)[0])
     q = np.asarray(cycle.anchor.q)[:, 0]
     size = np.asarray(cycle.settings.scale)[chart]

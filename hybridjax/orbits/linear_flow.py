@@ -1,9 +1,12 @@
-"""The linearized flow along one turn of a cycle, dense between events.
+"""The linearized flow along one period of a cycle, dense between events.
 
-The steps of one turn are recorded, and the field is linearized at nodes within each: the states
-there come from shorter steps of the same method. On these nodes, deviations and their adjoints
-follow from linear collocation equations, without further integration. At events they jump by the
-saltation matrix.
+`linear_flow(cycle, ...)` returns a `LinearFlow`. Responses, fluctuations, continuous HTFs and
+sensitivities are computed from it. The recorded steps of the last *turn* (the flow once around the
+cycle) are divided into *pieces*, which end at events, with `NODES` nodes in each. The states at the
+nodes come from shorter steps of the same method, and the field is linearized there. Deviations
+(`forward`) and their adjoints (`adjoint`) then follow from linear collocation equations, without
+further integration. At events, they are multiplied by the saltation matrix (`Jumps`). If a response
+is wrong everywhere, look at `_implicit`; if it is wrong after events, at `_jumps`.
 """
 
 import dataclasses
@@ -42,8 +45,8 @@ from .return_map import ReturnMap, Turn, with_derivatives
 from .scale import has_implicit
 
 
-# Nodes of a piece, both ends among them. Fewer: polynomials through them lose digits of responses.
-# More: collocation equations grow.
+# Number of nodes of a piece, including both ends. Fewer: polynomials through them lose digits of
+# responses. More: collocation equations grow.
 NODES = 12
 
 
@@ -53,9 +56,9 @@ class Rule(NamedTuple):
     nodes: Float[np.ndarray, " K"]
     weights: Float[np.ndarray, " K"]
     derivative: Float[np.ndarray, "K K"]
-    """From values at the nodes to derivatives there."""
+    """Matrix from values at the nodes to derivatives at the nodes."""
     coefficients: Float[np.ndarray, "K K"]
-    """From values at the nodes to coefficients of Legendre's polynomials."""
+    """Matrix from values at the nodes to coefficients of Legendre's polynomials."""
 
 
 @ft.lru_cache
@@ -63,7 +66,7 @@ def rule() -> Rule:
     legendre = np.polynomial.legendre
     unit = np.eye(NODES)
     derivatives = [legendre.legder(e) for e in unit]
-    # (Roots are real here, and complex numbers since NumPy 2.5.)
+    # (The roots are real, but NumPy 2.5 and later return complex numbers.)
     inner = legendre.legroots(derivatives[-1]).real
     x = np.r_[-1.0, np.sort(inner), 1.0]
     x = (x - x[::-1]) / 2
@@ -92,12 +95,13 @@ def polynomials(x: Float[Array, " p"]) -> Float[Array, "p K"]:
 
 
 class Jumps(NamedTuple):
-    """Deviations across the ends of pieces; where no event happens, they stay as they are."""
+    """Derivatives of the events at the ends of pieces. Where no event happens, deviations do not
+    change."""
 
     by_state: Float[Array, "P d d"]
     """The saltation matrix."""
     by_input: Float[Array, "P d nu"]
-    """Change of the state by an input that guard and reset depend on."""
+    """Change of the state by an input, where guard or reset depend on it."""
     delay_by_state: Float[Array, "P d"]
     """Change of the time of the event by the state before it."""
     delay_by_input: Float[Array, "P nu"]
@@ -127,7 +131,7 @@ class LinearFlow(eqx.Module):
 
     @property
     def turn(self) -> Float[Array, " P"]:
-        """Times of the beginnings of the pieces, from that of the turn."""
+        """Times of the beginnings of the pieces, since the beginning of the first one."""
         return self.t[:, 0] - self.t[0, 0]
 
     def evaluated(
@@ -142,13 +146,15 @@ class LinearFlow(eqx.Module):
         return by.reshape(P, K, rows, -1)
 
     def after(self, map: ReturnMap) -> Float[Array, "P K"]:
-        """Times of the nodes: those of the clock, or since the anchor of an autonomous cycle."""
+        """Times of the nodes: of the clock, or for an autonomous cycle, since the anchor."""
         return self.t if map.base is None else self.t - self.t[0, 0]
 
     def _implicit(
         self, sign: float, rows: slice, matrix: Float[Array, "P K d d"], size: Array
     ):
-        """The inverse of (derivative + sign h matrix) on some of the nodes, computed in sizes."""
+        """The inverse of (D + sign h matrix) on some of the nodes, where D takes derivatives at the
+        nodes and h is the length of the piece. It is computed in sizes (magnitudes) of the
+        states."""
         xp = namespace(self.q)
         d = self.q.shape[2]
         D = rule().derivative[rows, rows]
@@ -170,8 +176,8 @@ class LinearFlow(eqx.Module):
 
     @remembered
     def forward(self) -> tuple[Float[Array, "P K d d"], Float[Array, "P K d K d"]]:
-        """Deviations at the nodes of each piece by that at its beginning, and by forces at the
-        nodes (times the length of the piece)."""
+        """Derivatives of the deviations at the nodes of each piece, by the deviation at the
+        beginning of the piece, and by forces at the nodes (times the length of the piece)."""
         xp = namespace(self.q)
         d = self.q.shape[2]
         inverse = self._implicit(-1.0, slice(1, None), self.by_state, self.size)
@@ -185,7 +191,7 @@ class LinearFlow(eqx.Module):
 
     @remembered
     def adjoint(self) -> Float[Array, "P K d d"]:
-        """Covectors at the nodes of each piece by that at its end."""
+        """Derivatives of the covectors at the nodes of each piece by the covector at its end."""
         xp = namespace(self.q)
         d = self.q.shape[2]
         by_state = xp.swapaxes(self.by_state, -1, -2)
@@ -196,7 +202,7 @@ class LinearFlow(eqx.Module):
         return xp.concatenate([free, unit], axis=1)
 
     def covectors(self, end: Inexact[Array, "d r"]) -> Inexact[Array, "P K d r"]:
-        """Covectors at the nodes by those at the end of the turn."""
+        """Covectors at the nodes, from covectors `end` at the end of the turn."""
 
         def back(after, piece):
             jump, free = piece
@@ -212,10 +218,11 @@ class LinearFlow(eqx.Module):
     def at(
         self, phase: Array, period: Array, *values: Inexact[Array, "P K ..."]
     ) -> tuple[Array, ...]:
-        """Charts, and values that are given at the nodes, at some phases in cycles."""
+        """Charts at some phases (in cycles), and interpolated `values`, which are given at the
+        nodes."""
         xp = jnp if isinstance(phase, jax.Array) else namespace(self.q)
         time = xp.asarray(phase) % 1.0 * period
-        # (The last piece that begins there: those before may have the length 0.)
+        # (If several pieces begin at a phase, the last one is taken: the others have the length 0.)
         begins = xp.asarray(self.turn)
         following = xp.searchsorted(begins, time, side="right")
         k = xp.maximum(following - 1, 0)
@@ -230,16 +237,17 @@ class LinearFlow(eqx.Module):
 
     @remembered
     def pushed(self) -> Float[Array, "P K d nu K"]:
-        """Deviations at the nodes of each piece by inputs at the nodes."""
+        """Derivatives of the deviations at the nodes of each piece by the inputs at the nodes."""
         force = self.by_input * self.length[:, None, None, None]
         return namespace(force).einsum("piakb,pkbu->piauk", self.forward[1], force)
 
     def driven(self, waves: Inexact[Array, "P K f"]) -> tuple[Array, Array, Array]:
-        """Deviations by inputs that are `waves`, divided by the wave at the beginning of each
-        piece; and by those at the beginning of the turn, as further d columns.
+        """Deviations caused by inputs that are `waves` (each divided by its value at the beginning
+        of the piece); and, as further d columns, by the deviations at the beginning of the turn.
 
-        **Returns:** those where pieces begin (P, d, nu + d, f), the delays of the events at their
-        ends (P, nu + d, f), and those at the end of the turn (d, nu + d, f).
+        **Returns:** the deviations at the beginnings of pieces (P, d, nu + d, f), the delays of the
+        events at the ends of pieces (P, nu + d, f), and the deviations at the end of the turn (d,
+        nu + d, f).
         """
         xp = namespace(self.q)
         jumps = self.jumps
@@ -248,7 +256,8 @@ class LinearFlow(eqx.Module):
         f = waves.shape[2]
 
         def wide(x):
-            """With columns of zeros for the deviations at the beginning of the turn."""
+            """`x` with further columns of zeros, for the deviations at the beginning of the
+            turn."""
             kept = [(0, 0)] * (x.ndim - 2)
             return xp.pad(x, kept + [(0, d), (0, 0)])
 
@@ -256,7 +265,7 @@ class LinearFlow(eqx.Module):
         pushed_at_end = self.pushed[:, -1].reshape(P, -1, K)
         arrived = (pushed_at_end @ waves).reshape(P, d, nu, f)
 
-        # The same after the events.
+        # Deviations after the events.
         last = waves[:, -1, None]
         columns = arrived.reshape(P, d, -1)
         jumped = (jumps.by_state @ columns).reshape(P, d, nu, f)
@@ -286,7 +295,8 @@ class LinearFlow(eqx.Module):
 
     @remembered
     def through(self) -> Float[Array, "P d d"]:
-        """Deviations at the beginnings of pieces to those at the beginnings of the next."""
+        """Matrices from deviations at the beginning of each piece to deviations at the beginning of
+        the next."""
         return self.jumps.by_state @ self.forward[0][:, -1]
 
     def monodromy(self, valid: Bool[Array, " d"]) -> Float[Array, "d d"]:
@@ -302,7 +312,8 @@ _turns = Memory()
 
 
 def keep_turn(cycle: Any, turn: Turn) -> None:
-    """Keep the steps of a cycle's last turn, if the host took them: `last_turn` returns them."""
+    """Remember the steps of a cycle's last turn, if they were taken on the host, for
+    `last_turn`."""
     record = fixed((turn.pieces, turn.tapes))
     if turn.tapes is not None and not is_hidden(record):
         pieces, tapes = to_host(record)
@@ -310,21 +321,22 @@ def keep_turn(cycle: Any, turn: Turn) -> None:
 
 
 def remembering(cycle: Any, other: Any) -> Any:
-    """The cycle, which remembers the last turn of another one on the same orbit."""
+    """The cycle, which now remembers the last turn of `other`, a cycle on the same orbit."""
     _turns.recall(hosted(cycle), None, lambda: last_turn(other))
     return cycle
 
 
 def hosted(cycle: Any) -> Any:
-    """The cycle with its arrays on the host, the same at each call; itself if JAX traces it."""
+    """The cycle with its arrays on the host, the same object at each call. A cycle that JAX traces
+    is returned as it is."""
     if is_hidden(cycle) or on_host(cycle.period):
         return cycle
     return _hosted.recall(cycle, None, lambda: to_host(cycle))
 
 
 def last_turn(cycle: Any) -> Any:
-    """The starts and the steps of the pieces of a cycle's last turn, side by side; None where JAX
-    traces the cycle, and the host did not take them."""
+    """The starts and the recorded steps of the pieces of a cycle's last turn, side by side. None if
+    JAX traces the cycle and no steps are remembered."""
     cycle = hosted(cycle)
 
     def make():
@@ -338,7 +350,8 @@ def last_turn(cycle: Any) -> Any:
 
 
 def begin_later(cycle: Any, k: int) -> Any:
-    """A guess for neighbors of a clocked cycle that begins with its piece k, with its last turn."""
+    """A clocked cycle as a guess for similar systems, with its beginning moved to piece k. It
+    remembers its last turn."""
 
     def rolled(x):
         return np.roll(x, -k, axis=-1)
@@ -360,7 +373,8 @@ def begin_later(cycle: Any, k: int) -> Any:
 
 
 def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:
-    """The ends of pieces that begin as recorded. (The search may have expected another period.)"""
+    """The targets at which the recorded pieces end. (The search may have expected another
+    period.)"""
     ends = map.ends()
     time = np.append(lanes.t[1:], ends.time[-1])
     return dataclasses.replace(
@@ -371,8 +385,8 @@ def recorded_ends(map: ReturnMap, lanes: Lanes) -> Target:
 def linear_flow(
     cycle: Any, longest: float = np.inf, parameter: str | None = None
 ) -> LinearFlow:
-    """Linearize the flow along a cycle, in pieces no longer than this part of the period. Inputs
-    are those of the system, or a change of a parameter.
+    """Linearize the flow along a cycle. Inputs are those of the system, or, with `parameter`, a
+    change of this parameter. `longest`: longest piece, as a part of the period.
 
     **Raises:** `NeedsValues` inside of `jit` and `vmap`.
     """
@@ -390,16 +404,18 @@ def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
     return Structure(system) if parameter is None else Varied(system, parameter)
 
 
-# Explicit steps of a piece. More: its polynomials lose digits. Fewer: more pieces than needed.
+# Largest number of explicit steps in a piece. More: polynomials through the nodes lose digits.
+# Fewer: more pieces than needed.
 _STEPS = 4
 
 
 class _Pieces(NamedTuple):
-    """P pieces of one turn, in D directions: parts of several recorded moves between events."""
+    """P pieces of one turn, in D directions of derivatives. Each piece consists of several recorded
+    moves without an event in between."""
 
     first: Int[np.ndarray, " P"]
     last: Int[np.ndarray, " P"]
-    """Moves with which they begin and end."""
+    """The first and the last move of each piece."""
     time: Inexact[np.ndarray, "P K D"]
     """Times of the nodes."""
     length: Inexact[np.ndarray, "P D"]
@@ -410,7 +426,7 @@ class _Pieces(NamedTuple):
 def _pieces(
     moves: Moves, t: Inexact[np.ndarray, "1+M D"], most: int, longest: float
 ) -> _Pieces:
-    """Pieces of at most so many moves, none longer than this time.
+    """Divide a turn into pieces of at most `most` moves, none of which lasts longer than `longest`.
 
     **Arguments:** `t`: times at which moves begin, and the end of the turn.
     """
@@ -423,7 +439,8 @@ def _pieces(
     length = t[following] - t[first]
     event = np.maximum(moves.code[last], -1)
 
-    # Each of these is divided into equal parts. (Rounding divides no piece.)
+    # Each piece that is too long is divided into equal parts. (Not one that is too long by rounding
+    # only.)
     number = np.real(length[:, 0]) / longest
     count = np.ceil(number - 1e-9)
     count = np.maximum(count, 1).astype(int)
@@ -448,8 +465,8 @@ def _pieces(
 def _linear_flow(
     cycle: Any, longest: float, parameter: str | None, by: Any = None
 ) -> LinearFlow:
-    """The flow linearized at nodes of pieces, whose states follow from the recorded steps; or its
-    derivatives in the directions `by` of the cycle."""
+    """The flow linearized at the nodes of pieces; with `by`, its derivatives in these directions of
+    the cycle."""
     if not on_host(cycle.period):
         raise NeedsValues(
             "responses, sensitivities, fluctuations and HTFs in continuous time need the values of "
@@ -475,7 +492,7 @@ def _linear_flow(
         tangents = 1j * kernels.TINY * _along(s, map, lanes, tape, by)
         t = t + tangents[:, 0]
         q = q + tangents[:-1, 1:]
-    # (A step of an explicit method is short for the polynomials of a piece.)
+    # (One step of an explicit method is short, so that a piece may have several.)
     most = 1 if has_implicit(s) else _STEPS
     pieces = _pieces(moves, t, most, longest * period)
     chart = moves.chart[pieces.first]
@@ -495,7 +512,7 @@ def _linear_flow(
     by_field = with_derivatives(of, field, charts, times, states, d, u)
 
     def lay(x):
-        """Directions, pieces and nodes first."""
+        """Reshape lanes to axes of directions, pieces and nodes, which come first."""
         x = x.reshape(*x.shape[:-1], P, K, directions)
         return np.moveaxis(x, (-1, -3, -2), (0, 1, 2))
 
@@ -545,7 +562,7 @@ def _along(
     """Tangents of times and states at the starts of recorded moves and at the end of the turn."""
     ends = recorded_ends(map, lanes)
     begin, longer = beginning(by, s.d, s.directions)
-    # A turn that ends on a section ends at a time, too.
+    # (A turn that ends on a section has a time of its end, too.)
     start = map.anchor.t[0]
     full = map.expected
     time = np.where(np.isfinite(ends.time), ends.time, start + full)
@@ -572,7 +589,8 @@ def beginning(by: Any, d: int, directions: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def of_flow(tangents: Any) -> Any:
-    """The tangents of a cycle on which its flow depends, others replaced by `None`."""
+    """The tangents of those fields of a cycle on which its flow depends; `None` for other
+    fields."""
     nothing = jax.tree_util.tree_map(lambda _: None, tangents)
     anchor = tangents.anchor
     anchor = nothing.anchor._replace(t=anchor.t, q=anchor.q)
@@ -639,7 +657,8 @@ def _jumps(s: Structure, code, t, u, q) -> Jumps:
 
 
 def by_name(s: Structure, chart: Int[Array, " p"], states: Inexact[Array, "p d"]):
-    """Padded states, or what belongs to them, by name; NaN in charts that lack one."""
+    """Padded states (or numbers that belong to states) by name; NaN in charts that lack the
+    state."""
     xp = namespace(states)
     points = np.arange(len(chart))
     wide = xp.pad(states, [(0, 0), (0, 1)], constant_values=np.nan)

@@ -1,8 +1,12 @@
-"""Cycles of many systems near known ones, on the itineraries of these.
+"""Limit cycles of many systems, found along the recorded itineraries of known cycles.
 
-A `Route` is the itinerary of a known cycle. All systems first take that of the guess. What leaves
-it, or does not converge, begins again from a neighbor that did, or from a cycle that a search has
-found there, on that one's route.
+An *itinerary* is the sequence of charts, steps and events of a cycle, and a `Route` has that of a
+known cycle (`repeat.py`). `limit_cycles.py` makes a `Solver` and calls `run`. All systems first
+follow the route of the guess by Newton's method (`_take`). A system that leaves the route or does
+not converge begins again from a neighbor whose cycle is known, and follows the neighbor's route. If
+no route suits, a search finds one more cycle, whose route is tried for the remaining systems.
+Systems that still have no cycle are left to `batches.py`. A *lane* is one system of a call, and a
+*leg* a part between two events.
 """
 
 import collections
@@ -38,14 +42,14 @@ from .repeat import (
 from .return_map import ReturnMap
 
 
-# Lanes of a call. More: their arrays leave the cache. Fewer: calls cost more.
+# Number of lanes of a call. More: arrays do not fit the cache. Fewer: calls cost more.
 TILE = 250
-# Part of the systems that a route must suit, for another one to be tried. Larger: systems that
-# routes would suit are searched. Smaller: sweeps of relaxation oscillators, whose jumps each move
-# to other steps, try many in vain.
+# A further route is tried if the last one has suited at least this part of the systems. Larger:
+# systems that could follow a route are searched. Smaller: sweeps of relaxation oscillators, which
+# need other steps for each system, try many routes in vain.
 _WORTH = 0.125
-# Rounds in which systems begin from neighbors, and routes that searches find for systems that no
-# route suits. More: hopeless systems cost more. Fewer: more are left to the search.
+# Number of rounds in which systems begin from neighbors, and number of new routes that searches
+# find. More: hopeless systems cost more. Fewer: more are left to the search.
 _ROUNDS = 4
 _SEARCHES = 6
 
@@ -54,7 +58,7 @@ class Found(NamedTuple):
     """The cycles of S systems, some of them found; S is the leading axis of every array."""
 
     path: Int[np.ndarray, " S"]
-    """Number of the itinerary; negative for systems without a cycle."""
+    """Number of the itinerary that the system follows; negative for systems without a cycle."""
     q: Float[np.ndarray, "S d"]
     period: Float[np.ndarray, " S"]
     pieces_t: Float[np.ndarray, "S K"]
@@ -93,7 +97,7 @@ class Many(NamedTuple):
         return _Attempt(rows, found, code)
 
     def _in_tiles(self, function, route: Route, itinerary: Itinerary, rows, q, ends):
-        """A function of all lanes, in calls of one size."""
+        """Call a function of lanes for some systems, in calls of one size."""
         plan = Plan.of(itinerary)
         map = on_device(route.map)
         program = whole(function, (), (map,), loops=True)
@@ -119,7 +123,7 @@ class _Attempt(NamedTuple):
     rows: Int[np.ndarray, " n"]
     found: Corrected
     code: Int[np.ndarray, " n"]
-    """Those of `judge`, and of a second integration."""
+    """Result codes, from `judge` and a second integration."""
 
 
 def _correct(map: ReturnMap, numbers, plan: Plan, q, ends) -> Corrected:
@@ -134,9 +138,9 @@ class Solver:
     """The search for the cycles of many systems, route after route."""
 
     def __init__(self, many: Many, map: ReturnMap, search: Callable):
-        """**Arguments:** `map`: that of a known cycle. `search`: a function of the number of a
-        system, of that of one near it whose cycle is known, and of this solver, that returns the
-        return map of a cycle that it finds, or None."""
+        """**Arguments:** `map`: return map of a known cycle. `search(system, near, solver)`: finds
+        a cycle by a search, and returns its return map or None. (`system` and `near` are numbers of
+        systems; the cycle of `near` is known.)"""
         S = len(many.t)
         d = map.anchor.q.shape[0]
         self.many, self._search = many, search
@@ -186,7 +190,8 @@ class Solver:
                 return
 
     def nearest(self, rows, known) -> tuple[np.ndarray, np.ndarray]:
-        """Distances of systems to the nearest ones with known cycles, and the numbers of these."""
+        """For each system, the distance to the nearest one with a known cycle, and the number of
+        the latter."""
         distance, place = nearest(self._numbers[rows], self._numbers[known])
         return distance, known[place]
 
@@ -210,7 +215,7 @@ class Solver:
                 start = attempt.found.q[coarse], attempt.found.passage.ends[coarse]
                 again = many.attempt(route, rows[coarse], *start, finer=True)
                 self._keep(number, again, finer=True)
-            # (What has converged, and left the route, needs another one.)
+            # (A system that has converged and left the route needs another route.)
             rows = rows[attempt.code == Result.NOT_CONVERGED]
             known = np.flatnonzero(self.found.path // 2 == number)
             if not len(rows) or not len(known):
@@ -250,7 +255,7 @@ class Solver:
 
     @property
     def itineraries(self) -> list[Itinerary]:
-        """Those of all routes, two of each."""
+        """The itineraries of all routes, two of each (see `_DENSITIES` in `repeat.py`)."""
         return [x for route in self.routes for x in (route.first, route.finer)]
 
     def ends(self, path: int) -> Float[np.ndarray, "S E"]:
@@ -258,14 +263,14 @@ class Solver:
         return self._ends[path // 2]
 
 
-# The routes of the last calls: the same call again searches nothing. More: memory. Fewer: calls
-# that take turns search again.
+# Routes of the last calls, so that a repeated call needs no search. More: memory. Fewer:
+# alternating calls search again.
 _KEPT = 16
 _routes: collections.OrderedDict[Any, list[Route]] = collections.OrderedDict()
 
 
 def _key(map: ReturnMap, leaves: tuple[np.ndarray, ...]) -> tuple:
-    """All on which the routes of a call depend."""
+    """A key of everything on which the routes of a call depend."""
     arrays = [*jax.tree_util.tree_leaves(eqx.filter(map, eqx.is_array)), *leaves]
     digest = hashlib.sha1(usedforsecurity=False)
     for x in arrays:

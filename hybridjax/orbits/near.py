@@ -1,7 +1,12 @@
-"""A cycle near one that is known: a call that repeats another with other numbers.
+"""A cycle near a known one, along its recorded itinerary instead of by a search.
 
-It follows the route of the known cycle, as one program, also inside of programs of users and with
-derivatives. Outside of these, what leaves the route goes to the search.
+`find.py` calls this file if the guess is a cycle that has a `Route`: its recorded sequence of
+charts, steps and events (`repeat.py`). There are four functions: `traced_cycle` inside of programs
+of users; `derived_cycle` for derivatives outside of programs; `repeated_cycle` for calls that
+repeat with other parameters; `first_order_cycle` for fits. Each follows the route by Newton's
+method, in one compiled program. A cycle that leaves the route has a result code inside of programs,
+and is left to the search outside of them. If a cycle is wrong here and right from a search, look at
+`repeat.py`.
 """
 
 import collections
@@ -53,10 +58,10 @@ from .rivals import coincide_on
 from .verdict import verdict
 
 
-# Calls for systems of a class from which on they are compiled. Fewer: a program is compiled that is
-# not used again. More: repeated calls stay slow for longer.
+# Number of calls for systems of one class after which the program is compiled. Fewer: programs are
+# compiled and never used again. More: repeated calls stay slow for longer.
 _WORTH_COMPILING = 3
-# The same for derivatives outside of programs of users: compilation takes as long as so many
+# The same number for derivatives outside of programs: compilation takes as long as this many
 # derivatives on the host.
 _DERIVATIVES_WORTH_COMPILING = 24
 _routes = Memory()
@@ -65,7 +70,7 @@ _calls: collections.Counter = collections.Counter()
 
 
 def route_near(guess: LimitCycle) -> Route | None:
-    """The route of a cycle; None for one that has none (see `has_route`), has a fault, or is
+    """The route of a cycle. None if the cycle has no route (see `has_route`), has a fault, or is
     traced."""
     if is_traced(guess) or int(guess.result) != Result.OK:
         return None
@@ -91,7 +96,8 @@ def _beginning(route: Route, map: ReturnMap) -> tuple:
 
 
 def known_beside(cycle: LimitCycle) -> LimitCycle | None:
-    """The known cycle beside which a traced one was found on its route; None for others."""
+    """The known cycle on whose route a traced cycle was found; None for cycles that were found
+    otherwise."""
     return _beside.get(cycle, None)
 
 
@@ -103,7 +109,8 @@ def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
     """
     traced = [x.size for x in leaves_of(map) if is_tracer(x)]
 
-    # (The beginning depends on what is traced: it is made where that has derivatives.)
+    # (The beginning depends on traced values, so that it is made inside of the differentiated
+    # function.)
     def find(map: ReturnMap, **options: Any) -> Corrected:
         return _found(route, "all", _beginning(route, map), map, **options)
 
@@ -113,9 +120,12 @@ def traced_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle:
 
 
 def derived_cycle(known: LimitCycle, route: Route, map: ReturnMap) -> LimitCycle | None:
-    """The same outside of programs, once so many derivatives were asked for that it pays to compile
-    them. None if the search is to find the cycle: before that, where the cycle leaves the route,
-    for derivatives by many numbers, and where JAX hides values, as below `vmap`."""
+    """As `traced_cycle`, outside of programs.
+
+    None if the search is to find the cycle: for the first derivatives, which are not worth
+    compiling a program; if the cycle leaves the route; for derivatives by many parameters; and
+    where JAX hides values, as in `vmap`.
+    """
     key = "derivatives", route.first.form, identity((map.structure,))
     _calls[key] += 1
     traced = [x.size for x in leaves_of(map) if is_tracer(x)]
@@ -159,7 +169,8 @@ def _on_route_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
 
 
 def _hidden(*_: Any) -> Any:
-    """**Raises:** `_SearchError`: a code that is hidden could not send a cycle to the search."""
+    """**Raises:** `_SearchError`: the value of the code is hidden, so that it could not be decided
+    whether the search is needed."""
     raise _SearchError
 
 
@@ -167,7 +178,8 @@ _outside = by_columns(_hidden, _on_route_along)
 
 
 def with_numbers(route: Route) -> Route:
-    """The route with counts of rows as arrays, for which nothing is compiled again."""
+    """The route with counts of rows as arrays, so that other counts do not compile another
+    program."""
     finer = route.finer._replace(count=np.asarray(route.finer.count))
     return route._replace(first=finer, finer=finer, other=finer)
 
@@ -175,9 +187,9 @@ def with_numbers(route: Route) -> Route:
 def first_order_cycle(
     route: Route, map: ReturnMap, q: Float[Array, " d"]
 ) -> LimitCycle:
-    """The cycle of a return map whose system is traced, from a state near it on the route of a
-    known cycle. The anchor and the period have first derivatives, in forward mode; the rest has
-    none.
+    """The cycle of a return map whose system is traced, on the route of a known cycle, from a state
+    near the cycle. The anchor and the period have first derivatives in forward mode; other numbers
+    have none.
 
     A cycle that leaves the route has a result code.
     """
@@ -212,15 +224,15 @@ def _result(route: Route, map: ReturnMap, found: Corrected):
 
 
 def _coincide(route: Route, map: ReturnMap, passage: Passage):
-    """Whether events coincide that do not on the known cycle."""
+    """Whether events coincide that do not coincide on the known cycle."""
     begin = passage.pieces_t[0]
     together = coincide_on(map, route.first.events, passage.ends, begin, passage.t)
     return (together & ~route.together).any()
 
 
 def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
-    """The cycle of a return map near a known one; None if a search is needed: where the route is
-    left, does not lead to a cycle, or is not compiled yet."""
+    """The cycle of a return map near a known cycle. None if a search is needed: the cycle leaves
+    the route, Newton's method does not converge, or the program is not compiled yet."""
     route = route_near(guess)
     if route is None:
         return None

@@ -1,7 +1,12 @@
-"""Newton's method on the return map, and further attempts where it fails.
+"""Newton's method on the return map, and further attempts if it fails.
 
-Steps are taken, and convergence is tested, in sizes of the states. `search` lists the attempts: an
-attempt of another kind, such as a restart from a random state, is added there.
+`find.py` calls `search`, with a return map whose anchor is the initial state, and gets a
+`Solution`. A *turn* is one application of the return map: the flow from the section back to it,
+which consists of *moves* (steps with the events at their ends). Steps are taken, and convergence is
+tested, in *sizes* of the states (their magnitudes, `scale.py`). `search` lists the attempts: a
+further kind of attempt, such as a restart from a random state, is added there. On the host,
+`_root_on_host` has the iteration; inside of programs of JAX, `_root`. Derivatives of the result are
+implicit (`_root_jvp`, `_solve_along`).
 """
 
 import dataclasses
@@ -27,6 +32,7 @@ from ..engine.settings import TRANSIENT, Settings
 from ..engine.watch import slopes
 from .crossing import ListLevels
 from .return_map import CLOSED, SINGULAR, Return, ReturnMap, Turn, across
+from .scale import in_sizes
 from .shooting import (
     ATOL,
     RTOL,
@@ -38,25 +44,26 @@ from .shooting import (
 )
 
 
-# Steps that a good guess needs: a continuation then takes longer steps, and a system of a sweep
-# that needs more waits for others. More: a continuation steps too far, and calls of a sweep run for
-# few of their systems. Fewer: steps stay short, and most systems wait.
+# Newton steps that a good guess needs. With fewer steps, a continuation takes longer steps along
+# the branch; systems of a sweep that need more wait for the others. More: a continuation steps too
+# far, and calls of a sweep run for few of their systems. Fewer: steps stay short, and most systems
+# wait.
 USUAL_STEPS = 3
-# Steps before a point of a branch, or a system of a sweep, is given up. Fewer: distant cycles are
-# lost. More: hopeless ones cost more.
+# Steps before a point of a branch, or a system of a sweep, is given up. Fewer: cycles far from the
+# guess are lost. More: searches where there is no cycle take longer.
 FEW_STEPS = 8
 # Steps before a cycle is given up. Fewer: cycles far from the guess are lost. More: hopeless
 # searches last longer.
 MAX_STEPS = 32
-# Levenberg-Marquardt steps in which the residual falls by less than a tenth, where the search ends.
-# Fewer: slow searches are given up. More: searches where there is no cycle last longer.
+# The search ends after this many Levenberg-Marquardt steps in which the residual falls by less than
+# a tenth. Fewer: slow searches are given up. More: searches where there is no cycle last longer.
 STALLED = 10
-# Steps of the flow, after which Levenberg-Marquardt steps end. Fewer: cycles with long turns
-# are lost. More: vain searches among fast oscillations last for minutes.
+# Total number of steps of the flow after which Levenberg-Marquardt iterations end. Fewer: cycles
+# with long turns are lost. More: vain searches among fast oscillations last for minutes.
 _WORK = 40_000
-# The residual, in sizes, down to which Levenberg-Marquardt steps take rough turns. Larger: accurate
-# turns, four times as expensive, are taken where there is no cycle. Smaller: errors of rough turns
-# are taken for a residual that does not fall.
+# Levenberg-Marquardt iterations use rough turns (of low accuracy) until the residual, in sizes, is
+# below this. Larger: accurate turns, which are four times as expensive, are computed where there is
+# no cycle. Smaller: errors of rough turns keep the residual from falling.
 _ROUGH = 1e-3
 
 
@@ -78,9 +85,9 @@ class Solution(NamedTuple):
 
 
 def search(map: ReturnMap, patient: bool = False, near: Any = None) -> Solution:
-    """Newton's method from the anchor's state; where it fails, with another period, then with the
-    smaller steps of Levenberg and Marquardt. If `patient`, it ends at the limit on steps. `near`:
-    see `solve`."""
+    """Newton's method from the anchor's state. If it fails, it is repeated with another period,
+    then with Levenberg-Marquardt steps. If `patient`, it ends when a turn reaches the limit on
+    steps. `near`: see `solve`."""
     say("Newton's method")
     solution = solve(map, False, True, near)
     if int(solution.result) == Result.EXTRA_TURNS:
@@ -102,8 +109,8 @@ def search(map: ReturnMap, patient: bool = False, near: Any = None) -> Solution:
 
 
 def _ends(map: ReturnMap) -> bool:
-    """Test whether the turn from the anchor's state ends within the limit on steps: if it does,
-    a search that comes to the limit has left for states where the flow is another one."""
+    """Test whether the turn from the anchor's state ends within the limit on steps. If it does, a
+    search that reaches the limit has moved too far from the anchor."""
     return int(_first_turn(map).result) == Result.OK
 
 
@@ -116,13 +123,13 @@ def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
     q, turn, steps = root(map, MAX_STEPS, near)
     if (
         on_host(q) or not once_more
-    ):  # (the host's last turn begins at q but for rounding)
+    ):  # (the last turn on the host begins at q up to rounding)
         result = map.judge(q, turn)
     else:
         begin = turn.pieces.q[:, 0]
         turn = map.turn_with_jacobian(q, record=turn.record)
         result = map.judge(q, turn)
-        # (Far from where a turn was recorded, other events happen than in its record.)
+        # (Far from its recorded beginning, a turn has other events than its record.)
         apart = jnp.abs(q - begin) / map.sizes
         is_near = jnp.max(apart) <= CLOSED
         is_fixed = (result == Result.OK) | (result == Result.SINGULAR)
@@ -132,8 +139,8 @@ def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
 
 
 def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solution]:
-    """`solve` on the host, and its derivatives: implicit ones of the state, then those of the
-    recorded turn."""
+    """`solve` on the host, with derivatives: first of the state, by the implicit function theorem,
+    then of the recorded turn."""
     map, _, factors, _ = arguments
     by, *_ = directions
     solution = _solve(*arguments)
@@ -158,7 +165,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     # 0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
     end = orbit.tangents(begin)[-1, 1:].T
     moved = np.where(map.valid, end, 0.0) / sizes
-    jacobian = turn.jacobian * sizes / sizes[:, None]
+    jacobian = in_sizes(turn.jacobian, sizes)
     each = np.tile(jacobian, (P, 1, 1))
     begin[1:] = (newton_steps(each, moved) * sizes).T
     tangents = orbit.tangents(begin)
@@ -196,10 +203,10 @@ def solve(
 ) -> Solution:
     """Newton's method from the anchor's state.
 
-    **Arguments:** (Pass all where there are derivatives.) `once_more`: whether to compute one more
-    turn on the cycle, so that the result has the derivatives of the cycle. `factors`: whether
-    its pieces have them, too. `near`: the pieces of a similar cycle's turn and their tapes, side by
-    side, with which the host begins.
+    **Arguments:** (Give all of them if there are derivatives.) `once_more`: whether to compute one
+    more turn on the cycle, which gives the result its derivatives. `factors`: whether the Jacobians
+    of the pieces also have derivatives. `near`: recorded pieces of the turn of a similar cycle,
+    with which the iteration on the host begins.
     """
     return _solve(map, once_more, factors, near)
 
@@ -227,8 +234,8 @@ def root(
 def _root_on_host(
     map: ReturnMap, max_steps: int, near: Any
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method from the fixed point of the moves of a `near` turn, or from where rough turns
-    lead; if these lead nowhere, from the anchor's state."""
+    """Newton's method from the best beginning: the fixed point of the moves of a `near` turn, or
+    the state to which rough turns lead; if these fail, the anchor's state."""
     begin = map.anchor.q[:, 0] / map.sizes
     if near is not None:
         return _newton(map, *fixed_point(map, near, begin), 0, max_steps)
@@ -238,7 +245,7 @@ def _root_on_host(
         end = _newton(map, x, moves, steps, max_steps)
     if np.isfinite(end[0]).all():
         return end
-    # (Accurate turns take more steps: one tells how far they reach.)
+    # (Accurate turns take more steps: one turn shows whether the limit suffices.)
     vain = int(end[1].result) == Result.STEP_LIMIT
     return _newton(map, begin, None, 0, 1 if vain else max_steps)
 
@@ -253,8 +260,9 @@ def _rough(map: ReturnMap) -> ReturnMap:
 def _by_rough_turns(
     map: ReturnMap, x: np.ndarray
 ) -> tuple[np.ndarray, Moves | None, int, Turn]:
-    """Newton's method on rough turns, until the moves of one have a fixed point: that of these
-    moves, divided at full accuracy, the moves, the number of steps, and the last rough turn."""
+    """Newton's method on rough turns (of low accuracy), until the recorded moves of one have a
+    fixed point. The moves are then divided into accurate steps. Returns the fixed point of these,
+    the divided moves, the number of Newton steps, and the last rough turn."""
     rough_map = _rough(map)
     moves = None
     for steps in range(1, FEW_STEPS + 1):  # noqa: B007
@@ -278,22 +286,23 @@ def _by_rough_turns(
 def _newton(
     map: ReturnMap, x: np.ndarray, moves: Moves | None, first: int, max_steps: int
 ) -> tuple[np.ndarray, Turn, np.ndarray]:
-    """Newton's method from a state, in sizes, with the steps and the test of optimistix. The first
-    turn makes the `moves` if they are right; `first` steps were taken before."""
+    """Newton's method from a state, in sizes, with the same steps and test of convergence as in
+    optimistix. `moves`: expected moves of the first turn. `first`: number of steps that were taken
+    before."""
     for steps in itertools.count(first + 1):
         travelled = None
         if moves is not None:
             travelled = travel(map, x * map.sizes, moves)
         turn, step = _step_from(map, x, travelled)
         x = x + step
-        # (Gaps between moves may be as large as errors of steps.)
+        # (Gaps between moves are allowed to be as large as errors of steps.)
         close = turn.distance < ATOL + (
             np.asarray(map.settings.rtol) if travelled else 0.0
         )
-        # (The first state need not be as accurate as a Newton step.)
+        # (The initial state may be less accurate than a state after a Newton step.)
         small = excess(x[None], step[None])[0] < 1
         done = small and close and (travelled or steps > first + 1)
-        # (At infinity a turn may not close, although all states there do nearly the same.)
+        # (Far away, Newton steps may be small relative to the states although no turn closes.)
         stands = small and not travelled and steps > first + 1
         if done or stands or steps == max_steps or not np.isfinite(x).all():
             break
@@ -308,22 +317,22 @@ def _newton(
 def _step_from(
     map: ReturnMap, x: np.ndarray, travelled: Any = None
 ) -> tuple[Turn, np.ndarray]:
-    """The turn from a state, in sizes, and the Newton step."""
+    """The turn from a state, and the Newton step, both in sizes."""
     turn = map.turn_with_jacobian(x * map.sizes, travelled=travelled)
     sizes = map.sizes
-    jacobian = turn.jacobian * sizes / sizes[:, None]
+    jacobian = in_sizes(turn.jacobian, sizes)
     residual = turn.residual / sizes
     return turn, newton_steps(jacobian[None], residual[None])[0]
 
 
 class _Descent(NamedTuple):
-    """Where Levenberg-Marquardt steps have led, in sizes of the states."""
+    """The end of Levenberg-Marquardt steps, in sizes of the states."""
 
     x: Float[np.ndarray, " d"]
     turn: Turn
-    """The turn from there."""
+    """The turn from the state `x`."""
     residual: float
-    """Its size; infinite if no turn has closed."""
+    """Norm of the residual; infinite if no turn has closed."""
     damping: float
     """The square of the damping of the next step."""
     steps: int
@@ -331,7 +340,7 @@ class _Descent(NamedTuple):
 
 def _damped(map: ReturnMap) -> tuple[np.ndarray, Turn, np.ndarray]:
     """Levenberg-Marquardt steps from the anchor's state: on rough turns until one nearly closes,
-    and then on accurate ones."""
+    then on accurate turns."""
     begin = map.anchor.q[:, 0] / map.sizes
     damping = 1.0
     rough = _descent(_rough(map), begin, damping, _ROUGH)
@@ -363,9 +372,8 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
             least = size
             damping = damping / 3.5
             best = turn
-            jacobian = np.vstack(
-                [turn.jacobian * sizes / sizes[:, None], np.eye(len(x))]
-            )
+            scaled = in_sizes(turn.jacobian, sizes)
+            jacobian = np.vstack([scaled, np.eye(len(x))])
             error = np.append(residual, 0 * x)
         elif best is None:  # (no turn closes from here)
             break
@@ -374,7 +382,7 @@ def _descent(map: ReturnMap, x: np.ndarray, damping: float, enough: float) -> _D
         penalty = np.sqrt(damping) * np.eye(len(x))
         jacobian[len(x) :] = penalty
         step = -np.linalg.lstsq(jacobian, error)[0]
-        # (Short steps are at the end, or where none helps.)
+        # (Steps are short near the end, or where no step reduces the residual.)
         history.append(least)
         stalls = steps > STALLED and least > 0.9 * history[-1 - STALLED]
         excess_of_step = excess(x[None], step[None])
@@ -414,7 +422,7 @@ def _root(map, max_steps):
         max_steps=max_steps,
         throw=False,
     )
-    # An integer of JAX, not a weakly typed one, for which later programs would compile again.
+    # An integer of JAX with a strong type: later programs would be compiled again for a weak one.
     return (
         solution.value * map.sizes,
         solution.aux,
@@ -438,9 +446,8 @@ def _root_jvp(primals, tangents):
         return map.turn(q, turn.record).residual
 
     _, by_parameters = eqx.filter_jvp(again, (map,), (t_map,))
-    jacobian = (
-        map.turn_with_jacobian(q, record=turn.record).jacobian * sizes / sizes[:, None]
-    )
+    again_with_jacobian = map.turn_with_jacobian(q, record=turn.record)
+    jacobian = in_sizes(again_with_jacobian.jacobian, sizes)
     # (Solvers of lineax raise errors in reverse mode where derivatives are NaN.)
     step = jnp.linalg.pinv(jacobian, rtol=SINGULAR) @ (by_parameters / sizes)
     nothing = jax.tree_util.tree_map(lambda _: None, (turn, steps))
@@ -448,7 +455,7 @@ def _root_jvp(primals, tangents):
 
 
 def _linear_solver():
-    """A solver with no step along directions in which J - I is singular."""
+    """A linear solver that takes no step along directions in which J - I is singular."""
     import lineax as lx
 
     return lx.SVD(rcond=SINGULAR)
@@ -457,7 +464,8 @@ def _linear_solver():
 def _residual(x, map: ReturnMap):
     """(P(q) - q) in sizes for q = x sizes, and the `Turn`.
 
-    Its derivative is the Jacobian that comes with the turn, which is not traced again for it.
+    Its derivative is the Jacobian that is computed with the turn, so that the turn is not traced
+    again.
     """
     fixed = jax.lax.stop_gradient(x * map.sizes)
     turn = map.turn_with_jacobian(fixed)

@@ -1,4 +1,9 @@
-"""Whether the functions of a clocked system have the period of its clock, in programs."""
+"""Test whether the functions of a clocked system have the period of its clock.
+
+`has_period` is called by searches, verdicts and programs that repeat a cycle. It compares fields,
+guards, resets, predicates and schedules at some points with those one period later, and returns one
+truth value (`checks.py` names the function that differs, outside of programs).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +14,11 @@ from ..systems.transition import SAME_TIME, Scheduled
 from .scale import ROUNDING
 
 
-# The time at which functions are compared with those a period later, in parts of the period after
-# each point: fields that jump with a clock do not jump there.
+# At each point (t, q), functions are compared at the times t + `LATER` periods and one period after
+# that. (Clocks switch at simple fractions of the period; this number keeps away from them.)
 LATER = 0.0729
-# Largest difference, relative to the largest value at all points. Smaller: rounding errors of times
-# are taken for another period. Larger: functions of another period pass.
+# Largest allowed difference, relative to the largest value at all points. Smaller: rounding errors
+# of times are taken for another period. Larger: functions of another period pass.
 _SAME = 1e-6
 
 
@@ -25,7 +30,7 @@ def has_period(
     q: Float[Array, "d K"],
 ) -> Bool[Array, ""]:
     """Test whether fields, guards, resets, predicates and schedules repeat after a period, at
-    points of a turn. (A point at which a function is NaN is passed over.)"""
+    points of a turn. (Points at which a function is NaN are skipped.)"""
     times = t + LATER * period
     same = _schedules_fit(s, period)
     for a in range(len(s.charts)):
@@ -69,7 +74,7 @@ def _with_rate(function, t, q) -> tuple[Array, Array]:
 
 
 def _schedules_fit(s: Structure, period: Float[Array, ""]) -> Bool[Array, ""]:
-    """Test whether the period of each schedule divides that of the clock."""
+    """Test whether the period of the clock is a multiple of the period of each schedule."""
     fit = jnp.asarray(True)
     for transition in s.transitions:
         if isinstance(transition.guard, Scheduled):

@@ -1,8 +1,15 @@
-"""Cycles near one that is known: Newton's method on its itinerary, without a search.
+"""Newton's method for a cycle near a known one, along the recorded itinerary of the known cycle.
 
-The charts, events and steps of a turn are an `Itinerary` (`engine/itinerary`). `correct` repeats it
-from the states that Newton's method takes, and says whether all stayed as recorded. It is one
-program for all systems of a class, and is differentiable.
+The *itinerary* of a turn is its sequence of charts, steps and events (`engine/itinerary`), and a
+`Route` has the itineraries of a known cycle. `correct` repeats them from the states that Newton's
+method takes, without a search: it is one program for all systems of a class, and is differentiable.
+`judge` then tells from flags whether each trajectory has kept the itinerary, and `travel`
+integrates once more, by another method, as a check. `near.py` (single cycles), `many.py` (sweeps)
+and `fitting/` call these functions.
+
+A *turn* is the flow once around the cycle, a *leg* a part of it between two events, and a *lane*
+one of many systems side by side. A wrong cycle comes from `_corrected`; a cycle that is given up
+without need, from `judge` or `agrees`.
 """
 
 import dataclasses
@@ -31,51 +38,53 @@ from .crossing import Crossing, ListLevels
 from .periodic import has_period
 from .return_map import CLOSED, SINGULAR, ReturnMap, across
 from .rivals import coincide_on
-from .scale import ROUNDING, has_implicit
+from .scale import ROUNDING, has_implicit, in_sizes
 from .shooting import ATOL, RTOL
 
 
-# Turns before a lane is given up. Fewer: distant cycles are left to the search. More: lanes that
-# will not converge keep the others of their call waiting.
+# Newton steps (one turn each) before a lane is given up. Fewer: distant cycles are left to the
+# search. More: lanes that do not converge keep the other lanes of their call waiting.
 MOST_TURNS = 10
 
 
-# Size of a Newton step, relative to the accuracy of a step of the flow, at which no further turn is
-# taken. Larger: residuals stay near the tolerance. Smaller: one turn more for most lanes.
+# Newton's method ends if its step, relative to the accuracy of a step of the flow, is below this.
+# Larger: residuals stay near the tolerance. Smaller: one turn more for most lanes.
 _SMALL = 0.5
-# Steps of an itinerary for each one that the search took: first for all systems, then for those
-# whose errors are too large, and in programs, which cannot divide steps later. More: turns last
-# longer. Fewer: more systems need the second, and fewer keep their itinerary in programs. Implicit
-# steps differ much in length, and the fast phases of relaxation oscillators lie in other parts of
-# the period beside the known cycle.
+# Number of steps of an itinerary, relative to those that the search took. The first number is for
+# all systems of a sweep; the second for systems whose errors are too large, and for programs, which
+# cannot divide steps later. More: turns take longer. Fewer: more systems need the second number,
+# and fewer keep their itinerary in programs. For implicit methods the numbers are larger: their
+# steps differ much in length, and the fast phases of relaxation oscillators move to other parts of
+# the period.
 _DENSITIES = 0.9, 1.35
 _IMPLICIT_DENSITIES = 3.0, 6.0
-# Steps of the second integration for each one of the first: they share no node.
+# Number of steps of the second integration, relative to the first, so that the two share no node.
 _OTHER = 0.83
-# Largest distance, in sizes of the states, of the end of the second integration from its beginning,
-# and largest error of its steps, relative to what is allowed in the first. Larger: faults pass.
-# Smaller: errors of the second integration refuse cycles.
+# Largest distance between the beginning and the end of the second integration, in sizes of the
+# states; and largest error of its steps, relative to the error that steps of the first may have.
+# Larger: faults pass. Smaller: errors of the second integration refuse cycles.
 _APART = 1e-6
 _ROUGH = 1e3
-# Largest last correction of an event's time, as a part of the period. Larger: an event that the
-# corrections have not reached passes. Smaller: rounding errors of times do not.
+# Largest allowed last correction of an event's time, as a part of the period. Larger: events pass
+# whose corrections have not converged. Smaller: rounding errors of times do not pass.
 _LAST_CORRECTION = 1e-10
 
 
-# Derivatives of a cycle: none; first ones, of the state at its beginning and of the period; all,
-# for which the last turn is repeated.
+# Which derivatives a result has: none; first derivatives of the state at the beginning and of the
+# period; or all derivatives, for which the last turn is repeated.
 Derivatives: TypeAlias = Literal["none", "first", "all"]
 
 
 class Plan(eqx.Module):
-    """An itinerary as an argument of programs: what a trajectory repeats."""
+    """An itinerary as an argument of programs."""
 
     form: Form = eqx.field(static=True)
     rows: Rows
     count: Int[Array, ""] | None
-    """Of rows that do something; None for a loop over all of them, which reverse mode needs."""
+    """Number of rows of the table that are not empty; None for a loop over all rows, which reverse
+    mode needs."""
     ends: Float[Array, " E"]
-    """Ends of legs, from the beginning of the recorded trajectory."""
+    """Times at which legs end, since the beginning of the recorded trajectory."""
     last: Int[Array, ""]
     """Number of the last leg."""
     charts: Int[Array, " K"]
@@ -83,7 +92,7 @@ class Plan(eqx.Module):
 
     @classmethod
     def of(cls, itinerary: Itinerary) -> "Plan":
-        """That of a loop that ends with the last row."""
+        """The plan of an itinerary, with a loop that ends at the last row that is not empty."""
         return cls(
             form=itinerary.form,
             rows=itinerary.rows,
@@ -94,14 +103,14 @@ class Plan(eqx.Module):
         )
 
     def code(self, passage: Passage, begin: Array, period: Array) -> Int[Array, "*L"]:
-        """The codes of trajectories that began at these times, on cycles with these periods:
-        whether they have kept the itinerary, with steps that are fine enough."""
+        """The result codes of trajectories that began at the times `begin`, on cycles with these
+        periods: whether they have kept the itinerary, with steps that are fine enough."""
         xp = namespace(passage.t)
         ends = passage.ends
         first = begin[..., None]
         begins = xp.concatenate([first, ends[..., :-1]], axis=-1)
         durations = ends - begins
-        # (Rounding makes legs that last no time negative.)
+        # (The duration of a leg without duration may be negative by rounding.)
         shortest = -ROUNDING * period[..., None]
         forwards = durations >= shortest
         unused = np.arange(ends.shape[-1]) > self.last
@@ -116,7 +125,7 @@ class Plan(eqx.Module):
 
 
 def _number(x: Any) -> Array:
-    """A number as an array, of which nothing is compiled; in programs it may be traced."""
+    """A number as an array, made without compiling anything. It may be traced."""
     return x if isinstance(x, jax.Array) else np.asarray(x)
 
 
@@ -133,21 +142,22 @@ class Route(NamedTuple):
     """The itinerary of a known cycle."""
 
     map: ReturnMap
-    """Of the known cycle."""
+    """Return map of the known cycle."""
     first: Itinerary
     finer: Itinerary
     other: Itinerary
-    """Of the second integration."""
+    """Itinerary of the second integration."""
     together: Bool[np.ndarray, " E"]
     """Which events of the known cycle have a rival (see `coincide_on`)."""
 
 
 def has_route(map: ReturnMap) -> bool:
-    """Test whether the flags of a route tell all that may happen beside it.
+    """Test whether the flags of a route notice every way in which a nearby trajectory may leave it.
 
-    They do not tell whether a cycle of several turns closes sooner, a scheduled event has become
-    enabled, or a field has a pulse that is shorter than a step. (A pulse at a pole reaches the
-    nodes of the two integrations.)
+    Flags do not notice that a cycle of several turns closes sooner, that a scheduled event has
+    become enabled, or that a field has a pulse shorter than a step. Systems in which this is
+    possible have no route. (A pulse at a pole is wide enough to be seen by one of the two
+    integrations.)
     """
     s = map.structure
     scheduled = [x for x in s.transitions if isinstance(x.guard, Scheduled)]
@@ -159,7 +169,7 @@ def has_route(map: ReturnMap) -> bool:
 def route_of(map: ReturnMap, turn: tuple[Lanes, Tape] | None = None) -> Route:
     """The route of a cycle, the fixed point of a return map.
 
-    **Arguments:** `turn`: the recorded pieces, side by side. Default: those of another turn.
+    **Arguments:** `turn`: recorded pieces of a turn, side by side. Default: a new turn is recorded.
     """
     map = to_host(map)
     pieces = side_by_side(to_host(map.pieces())) if turn is None else turn
@@ -188,16 +198,17 @@ class Corrected(NamedTuple):
     passage: Passage
     """The last turn."""
     jacobian: Float[Array, "d d"]
-    """Of P(q) - q, less the steps back to values of conserved quantities."""
+    """Derivative of P(q) - q, less the steps back to given values of conserved quantities."""
     distance: Float[Array, ""]
-    """Largest part of P(q) - q in sizes of the states."""
+    """Largest entry of P(q) - q, in sizes of the states."""
     excess: Float[Array, ""]
-    """Size of the Newton step that would follow, relative to the tolerance."""
+    """Length of the next Newton step, relative to the tolerance."""
     turns: Int[Array, ""]
 
 
 def levels_of(map: ReturnMap) -> ListLevels | None:
-    """The level on which a turn ends; None for one that ends at a time, or with an event."""
+    """The level function at whose zero a turn ends; None for a turn that ends at a time or with an
+    event."""
     return ListLevels((map.base,)) if isinstance(map.base, Crossing) else None
 
 
@@ -205,7 +216,8 @@ class Maps(NamedTuple):
     """Return maps of one system, or of many in lanes on the first axis of arrays."""
 
     map: ReturnMap
-    """With the numbers that all share; in place of the others, those of some lane."""
+    """The map, with the numbers that all lanes share. Numbers that differ between lanes are those
+    of one lane."""
     numbers_of_system: tuple[Array, ...]
     """The arrays of the systems, as leaves."""
     t: Float[Array, "*L"]
@@ -257,7 +269,8 @@ def leaves_of(system: Any) -> tuple[Array, ...]:
 
 
 def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
-    """One turn: its passage, and P(q) - q less the step back to conserved values.
+    """One turn: its passage, and P(q) - q less the step back to given values of conserved
+    quantities.
 
     **Arguments:** `options`: of `follow`.
     """
@@ -293,15 +306,14 @@ def turn(maps: Maps, plan: Plan, q, ends, **options: Any):
 
 
 def _newton(map: ReturnMap, factors, residual, q):
-    """The Jacobian of the residual, the Newton step, its size relative to the tolerance, and that
-    of the residual in sizes of the states."""
+    """The Jacobian of the residual, the Newton step, the length of the step relative to the
+    tolerance, and the largest entry of the residual in sizes of the states."""
     whole = monodromy(factors)
     product = jnp.where(map.valid[:, None], whole, 0.0)
     unit = jnp.eye(len(q))
     jacobian = product - unit - map.held(q)[1]
     sizes = map.sizes
-    scaled = jacobian * sizes / sizes[:, None]
-    step = -solve_by_columns(scaled, residual / sizes)
+    step = -solve_by_columns(in_sizes(jacobian, sizes), residual / sizes)
     tolerance = ATOL + RTOL * jnp.abs(q / sizes)
     excess = jnp.max(jnp.abs(step) / tolerance)
     distance = jnp.max(jnp.abs(residual) / sizes)
@@ -332,7 +344,7 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         is_small = excess <= enough
         stays_small = (excess <= 1) & (before.excess <= 1)
         closed = is_small | stays_small
-        # (Where multipliers are zero, the state converges before the times of events do.)
+        # (With multipliers of zero, the state converges before the times of events do.)
         closed = closed & (passage.last <= _LAST_CORRECTION * maps.expected)
         return found, _where(settled, q, q + step), settled | closed
 
@@ -340,14 +352,14 @@ def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
         found, _, settled = carry
         return (~settled & (found.turns < MOST_TURNS)).any()
 
-    # (A first turn before the loop would be compiled twice.)
+    # (With a turn before the loop, the turn would be compiled twice.)
     unsettled = jnp.zeros(q.shape[:-1], bool)
     begin = _nothing_yet(q, ends), q, unsettled
     return jax.lax.while_loop(going, again, begin)[0]
 
 
 def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
-    """The beginning of Newton's method."""
+    """The initial value of the loop of Newton's method, before any turn."""
     lanes = q.shape[:-1]
     d = q.shape[-1]
     K = PIECES
@@ -355,19 +367,26 @@ def _nothing_yet(q: Float[Array, "*L d"], ends) -> Corrected:
     def zeros(*shape):
         return jnp.zeros((*lanes, *shape))
 
-    factors = zeros(K, d, d)
-    pieces = zeros(K), zeros(K, d), zeros(K, d), factors
-    inside = jnp.zeros(lanes, bool)
-    passage = Passage(zeros(), q, ends, *pieces, zeros(d), zeros(), zeros(), inside)
-    unsolved = zeros() + jnp.inf
-    turns = jnp.zeros(lanes, int)
+    passage = Passage(
+        t=zeros(),
+        q=q,
+        ends=ends,
+        pieces_t=zeros(K),
+        pieces_q=zeros(K, d),
+        rates=zeros(K, d),
+        factors=zeros(K, d, d),
+        delay=zeros(d),
+        error=zeros(),
+        last=zeros(),
+        left=jnp.zeros(lanes, bool),
+    )
     return Corrected(
         q=q,
         passage=passage,
         jacobian=zeros(d, d),
         distance=zeros(),
-        excess=unsolved,
-        turns=turns,
+        excess=jnp.full(lanes, jnp.inf),
+        turns=jnp.zeros(lanes, int),
     )
 
 
@@ -383,10 +402,10 @@ def _solved(maps: Maps, plan: Plan, q, ends) -> Corrected:
 
 @_solved.def_jvp
 def _solved_jvp(primals, tangents):
-    """0 = P(q, p) - q moves q by -(J - I)^-1 dP/dp.
+    """The implicit function theorem: from P(q, p) - q = 0, q changes by -(J - I)^-1 dP/dp.
 
-    The derivative of a turn is taken twice, in a loop that is compiled once: first where q stands,
-    for dP/dp, then where it moves.
+    The derivative of a turn is taken twice, in a loop that is compiled once: first with q fixed,
+    which gives dP/dp, then with q changing.
     """
     maps, plan, *_ = primals
     by_maps = _without_settings(tangents[0])
@@ -411,7 +430,7 @@ def _solved_jvp(primals, tangents):
 
 
 def _without_settings(by_maps: Any) -> Any:
-    """Derivatives of maps, whose settings have none."""
+    """Derivatives of maps, without those of their settings."""
     fixed = jax.tree_util.tree_map(lambda _: None, by_maps.map.settings)
     return eqx.tree_at(
         lambda x: x.map.settings, by_maps, fixed, is_leaf=lambda x: x is None
@@ -436,8 +455,8 @@ def _root_and_period(maps: Maps, plan: Plan, q, ends) -> Corrected:
 
 @_root_and_period.def_jvp
 def _root_and_period_jvp(primals, tangents):
-    """First derivatives of the state, and of the time at the end of the turn, from the Jacobian
-    that Newton's method has used."""
+    """First derivatives of the state and of the time at the end of the turn, by the Jacobian of the
+    last Newton step."""
     maps, plan, *_ = primals
     found = _root_and_period(*primals)
     q = found.q
@@ -460,8 +479,8 @@ def correct(
 ) -> Corrected:
     """Newton's method on an itinerary.
 
-    **Arguments:** `q`: states at the anchors. `ends`: guessed ends of legs. `derivatives`: those of
-    the result. (Reverse mode needs a plan without a count of rows.)
+    **Arguments:** `q`: states at the anchors. `ends`: guessed ends of legs. `derivatives`: which
+    derivatives the result has. (Reverse mode needs a plan without a count of rows.)
     """
     still = jax.lax.stop_gradient
     if derivatives == "none":
@@ -474,8 +493,8 @@ def correct(
 def factors_across(
     map: ReturnMap, itinerary: Itinerary, passage: Passage
 ) -> Float[Array, "*L K d d"]:
-    """The factors of the monodromy matrix; of an autonomous system, on the states modulo the
-    direction of the flow."""
+    """The factors of the monodromy matrix. In an autonomous system, the direction of the flow is
+    projected out."""
     if map.base is None:
         return passage.factors
     xp = namespace(passage.q)
@@ -505,7 +524,7 @@ def travel(maps: Maps, plan: Plan, q, ends) -> Check:
     """Check cycles by a second integration."""
     import diffrax
 
-    # (Implicit methods of diffrax need Jacobians of all columns: only the steps are others.)
+    # (With implicit methods, the second integration has other steps, but the same method.)
     implicit = has_implicit(maps.map.structure)
     solver = None if implicit else diffrax.Dopri8(scan_kind="lax")
     passage, _ = turn(maps, plan, q, ends, solver=solver, columns=False)
@@ -526,8 +545,8 @@ def periodic(maps: Maps, charts: Int[Array, " K"], passage: Passage):
 
 
 def judge(route: Route, found: Corrected, t, expected) -> Int[Array, "*L"]:
-    """The codes of lanes with these times of the anchor and expected periods: whether Newton's
-    method converged, whether the route was kept, and whether its steps were fine enough."""
+    """The result codes of lanes: whether Newton's method converged, whether the route was kept, and
+    whether its steps were fine enough. `t`: times of the anchors."""
     passage = found.passage
     xp = namespace(found.q)
     converged = xp.isfinite(found.excess) & (found.excess <= 1)
@@ -542,13 +561,13 @@ def judge(route: Route, found: Corrected, t, expected) -> Int[Array, "*L"]:
 
 
 def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
-    """Whether cycles are isolated, last as long as expected if a clock drives them, and are no
-    equilibria."""
+    """Whether cycles are isolated, are no equilibria, and have the period of the clock if there is
+    one."""
     passage = found.passage
     xp = namespace(found.q)
     # (On a cycle that is not isolated, Newton's method ends anywhere.)
     sizes = route.map.sizes
-    defect = found.jacobian * sizes / sizes[:, None]
+    defect = in_sizes(found.jacobian, sizes)
     isolated = xp.min(svdvals(defect), axis=-1) >= SINGULAR
     if route.map.base is None:
         # (The last event of a turn that ends with one may come later than the turn ends.)
@@ -562,8 +581,8 @@ def _is_alone(route: Route, found: Corrected, t, expected) -> Bool[Array, "*L"]:
 
 
 def agrees(route: Route, q, check: Check) -> Bool[Array, "*L"]:
-    """Whether a second integration from states q closes, and keeps the route, and functions have
-    the period of the clock."""
+    """Whether the second integration from states q closes and keeps the route, and whether
+    functions have the period of the clock."""
     xp = namespace(q)
     other = check.passage
     difference = xp.abs(other.q - q)

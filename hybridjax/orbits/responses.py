@@ -1,10 +1,15 @@
-"""Responses of a cycle to brief pushes: of its phase, and of the amplitudes of its Floquet modes.
+"""Responses of a cycle to brief pushes: how much its phase and the amplitudes of its Floquet modes
+change.
 
 The phase response Z of a cycle satisfies dZ/dt = -(Df)^T Z along it, Z(t-)^T = Z(t+)^T S at events
 with the saltation matrix S, and Z . f = 1. The response I of the amplitude of a mode with the
 multiplier exp(kappa T) satisfies dI/dt = -(Df - kappa)^T I with the same jumps, and I . v = 1 for
 the mode v (G. B. Ermentrout, D. H. Terman, Mathematical foundations of neuroscience, Springer 2010,
 Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
+
+`LimitCycle.responses` calls `responses`, which gets Z and I at the nodes of the `LinearFlow` of the
+cycle (`linear_flow.py`) and returns a `Responses`. `loop` gives Z at phase 0, and `_modes` the
+multipliers and modes. A *push* is a brief input or a jump of a state.
 """
 
 import functools as ft
@@ -45,6 +50,7 @@ from ..systems.surfaces import SlidingChart
 from .crossing import to_section
 from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
+from .scale import in_sizes
 
 
 # Modes with multipliers below this modulus have no amplitude response. Smaller: rounding errors,
@@ -56,7 +62,7 @@ Phases = Annotated[Numbers, Reals("p")]
 
 
 class PhaseCurve(Showable, eqx.Module):
-    """The phase response to one input over one cycle, of a model or measured.
+    """The phase response to one input over one cycle: computed from a model, or measured.
 
     **Fields:** `phase` (P,), in cycles; `values` (P,), in cycles per unit of time and of the input,
     with NaN between both sides of an event; `input`; `time_unit`.
@@ -78,13 +84,13 @@ class PhaseCurve(Showable, eqx.Module):
 
 
 class Impulse(NamedTuple):
-    """The response to an input that acts at an event, through its guard or reset: there, the input
-    changes the phase or the amplitude by `weight` times its value."""
+    """The response to an input that acts at an event, through a guard or a reset: the value of the
+    input at the event, times `weight`, changes the phase or the amplitude."""
 
     event: str
     phase: Float[Array, ""]
     weight: dict[str, Inexact[Array, ""]]
-    """By name of the input."""
+    """Change per unit of each input, by name of the input."""
 
 
 class Locked(NamedTuple):
@@ -119,8 +125,8 @@ class Coupling(Showable, eqx.Module):
 
     @property
     def locking(self) -> tuple[float, float]:
-        """The least and the largest frequency of a push that the cycle follows, less that of the
-        cycle, per strength of the push: the Arnold tongue, to first order."""
+        """The Arnold tongue, to first order: least and largest difference between the frequency of
+        a push that entrains the cycle and the frequency of the cycle, per strength of the push."""
         values = self([x.lead for x in self._slope._zeros()] or [0.0])
         return float(values.min()), float(values.max())
 
@@ -140,7 +146,7 @@ class Coupling(Showable, eqx.Module):
         return Coupling(rates * c)
 
     def _zeros(self) -> tuple[Locked, ...]:
-        """Zeros in one cycle, with the slopes there."""
+        """Zeros in one cycle, with their slopes."""
         from scipy import optimize  # (a third of a second)
 
         steps = 16 * len(self.coefficients)
@@ -163,7 +169,7 @@ class Coupling(Showable, eqx.Module):
         return tuple(locked)
 
 
-# When responses were made, for messages.
+# How messages call the time at which responses were computed.
 _MADE = "these responses were computed"
 
 
@@ -197,7 +203,8 @@ class Responses(Showable, eqx.Module):
     """The phase response in time; `None` if clocked."""
     of_amplitudes: Inexact[Array, "r P K d"]
     surface: Float[Array, "P K d d"]
-    """The effect of a push, less what sliding undoes."""
+    """Derivative of the state after a push by the push: a part of it is lost where the state slides
+    on a surface."""
 
     def phase(
         self, phase: Phases, unit: Unit = "time"
@@ -477,10 +484,10 @@ def asymptotic_phase(
 
 
 def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
-    """M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple, and the phase
-    response at the beginning; M - I and zeros for a clock.
+    """The matrix M - I + f w^T with w . f = 1, which is regular if the multiplier 1 is simple; and
+    the phase response at the beginning. In a clocked system: M - I, and zeros.
 
-    **Raises:** `ComputationError` if it is not simple.
+    **Raises:** `ComputationError` if the multiplier 1 is not simple.
     """
     xp = namespace(f)
     size = map.sizes
@@ -491,8 +498,7 @@ def loop(map: ReturnMap, monodromy: Float[Array, "d d"], f: Float[Array, " d"]):
     back = f[:, None] * along
     closed = monodromy - xp.eye(len(f)) + back
     if on_host(f):
-        scaled = closed * size / size[:, None]
-        smallest = svdvals(scaled)[-1]
+        smallest = svdvals(in_sizes(closed, size))[-1]
         if map.conserved or not smallest > SINGULAR:
             raise ComputationError(
                 "the cycle has no defined phase: its multiplier 1 is double, as in a family of "
@@ -507,7 +513,7 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
     **Raises:** `ComputationError` for multipliers that coincide.
     """
     xp = namespace(M)
-    scaled = M * size / size[:, None]
+    scaled = in_sizes(M, size)
     values, right = xp.linalg.eig(stop_gradient(scaled))
     lower_last = 1e-9 * (xp.imag(values) < 0)
     order = xp.argsort(-xp.abs(values) + lower_last, stable=True)
@@ -527,10 +533,10 @@ def _modes(M: Float[Array, "d d"], size: Float[Array, " d"], count: int | None):
 
 
 def _mode(M: Float[Array, "d d"], size: Float[Array, " d"], value, right):
-    """An eigenvalue of M with its right and left eigenvectors, in units of the states, near an
-    approximation, by one Newton step, which also carries derivatives.
+    """An eigenvalue of M with its right and left eigenvectors, in units of the states. One Newton
+    step from an approximation also gives them derivatives.
 
-    **Raises:** `ComputationError` for one that coincides with another.
+    **Raises:** `ComputationError` for an eigenvalue that coincides with another one.
     """
     xp = namespace(M)
     n = len(M)

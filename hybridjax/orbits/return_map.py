@@ -1,11 +1,14 @@
-"""The return map of a cycle.
+"""The return map P of a cycle: from a state on the section to the state where the flow meets it
+again.
 
-One turn is cut into pieces. The Jacobians of the pieces are computed with the pieces: their product
-is the Jacobian of the return map, and they are the factors of the monodromy matrix.
+One application of P is called a *turn*. It is cut into *pieces* of nearly equal duration. The
+Jacobians of the pieces are computed with the pieces: their product is the Jacobian of P, and they
+are the factors of the monodromy matrix. *Sizes* of states are their magnitudes (`scale.py`), and a
+*lane* is one trajectory of many that are computed side by side.
 
-`ReturnMap.turn` and `turn_with_jacobian` compute a turn; `_linear_on_host` and `_linear_in_program`
-are two ways to the same Jacobians, which must agree. `judge` decides whether a turn is a cycle, and
-gives the reason if it is none.
+Searches call `ReturnMap.turn` and `turn_with_jacobian`, and get a `Return` or a `Turn`. There are
+two ways to the same Jacobians, which must agree: `_linear_on_host` (NumPy) and `_linear_in_program`
+(JAX). `judge` decides whether a turn is a cycle, and returns the reason if it is none.
 """
 
 import dataclasses
@@ -50,29 +53,31 @@ from ..systems.varied import Varied
 from .crossing import AtEvent, Crossing, to_section
 
 
-# Least bound on the steps of a piece of a turn with an implicit method, and of the flow from one
-# section to the next. Smaller: a fast jump, as of van der Pol's oscillator at mu = 1000, or many
-# events reach it. Larger: vain searches last longer.
+# Least value of the limit on steps, for a piece of a turn with an implicit method and for the flow
+# from one section to the next. Smaller: a fast jump (van der Pol's oscillator at mu = 1000) or many
+# events reach the limit. Larger: vain searches last longer.
 PATIENCE = 1024
-# Steps of a piece of a turn where the default limit, which ends searches that run away, is reached.
-# Fewer: neurons have no cycle. More: vain searches last longer.
+# Limit on the steps of a piece of a turn after the default limit was reached. Fewer: cycles of
+# neurons are not found. More: vain searches last longer.
 ENOUGH = 4096
-# The part of the last period after which an autonomous system is integrated to its section.
-# Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return. At
-# a simple fraction, pieces end on the events of symmetric cycles.
+# In an autonomous system, crossings of the section count after this part of the expected period.
+# Nearer to 1: a shorter return is missed. Smaller: an earlier crossing is taken for the return.
+# (Not a simple fraction: pieces would end at the events of symmetric cycles.)
 _FREE = 0.73
-# Smallest singular value of J - I, in sizes of the states, at which it is singular. Smaller: cycles
-# of a family pass for isolated ones. Larger: cycles with a multiplier near 1 are rejected.
+# J - I (in sizes of the states) is singular if its smallest singular value is below this. Smaller:
+# cycles of a family pass for isolated ones. Larger: cycles with a multiplier near 1 are rejected.
 SINGULAR = 1e-7
-# Largest distance, in sizes of the states, at which a turn closes. Smaller: rounding rejects cycles
-# of sweeps. Larger: turns that Newton's method has not finished are accepted.
+# A turn closes if the distance of its ends, in sizes of the states, is below this. Smaller:
+# rounding rejects cycles of sweeps. Larger: turns that Newton's method has not finished are
+# accepted.
 CLOSED = 2e-8
-# A turn closes at most at this multiple of the accuracy of the flow, or of the derivative of the
-# turn. Smaller: rounding rejects cycles. Larger: errors of the cycle exceed the accuracy asked for.
+# Its distance must also be below this multiple of the accuracy of the flow, or of the accuracy
+# times the derivative of the turn. Smaller: rounding rejects cycles. Larger: errors of the cycle
+# exceed the accuracy asked for.
 _ACCURACIES = 20.0
 _ROUNDED = 1e-12
-# Multiple of the accuracy by which no state of an equilibrium moves. Smaller: an equilibrium passes
-# for a cycle. Larger: small cycles are taken for equilibria.
+# The state is an equilibrium if no state moves by more than this multiple of the accuracy. Smaller:
+# an equilibrium passes for a cycle. Larger: small cycles are taken for equilibria.
 _REST = 1e3
 
 
@@ -87,11 +92,12 @@ class Return(NamedTuple):
     result: Int[Array, ""]
     """`Result` code of the flow."""
     end: Lanes
-    """The lane there."""
+    """The lane at the end."""
 
 
 class Turn(NamedTuple):
-    """One turn with its derivatives, for Newton's method: first all of its `Return`."""
+    """One turn with its derivatives, for Newton's method. The first fields are those of its
+    `Return`."""
 
     residual: Float[Array, " d"]
     period: Float[Array, ""]
@@ -102,18 +108,19 @@ class Turn(NamedTuple):
     pieces: Lanes
     """States at the beginnings of the K pieces."""
     factors: Float[Array, "K d d"]
-    """Jacobians of the flow over the pieces; for an autonomous system on the states modulo the
-    direction of the flow."""
+    """Jacobians of the flow over the pieces. In an autonomous system, the direction of the flow is
+    projected out."""
     codes: Int[Array, "K R"]
-    """Events of each piece, by index of the transition; negative for none. (None in sweeps.)"""
+    """Events of each piece, by index of the transition; negative for none. (`None` in sweeps.)"""
     distance: Float[Array, ""]
-    """Largest part of the residual in sizes of the states."""
+    """Largest entry of the residual, in sizes of the states."""
     meetings: Int[Array, ""]
-    """Number of crossings of the section on which the turn ended, as far as its pieces show."""
+    """Number of crossings of the section during the turn, as far as the states at the ends of
+    pieces show."""
     record: Recorded | None
-    """The pieces, and the lengths, ends and events of their steps (K each). (None on the host.)"""
+    """The K pieces with the lengths, ends and events of their steps. (`None` on the host.)"""
     tapes: Tape | None
-    """All of their steps, by piece. (None in sweeps.)"""
+    """The recorded steps of all pieces. (`None` in sweeps.)"""
 
     @property
     def closed(self) -> Bool[Array, "..."] | Bool[np.ndarray, "..."]:
@@ -199,11 +206,12 @@ class ReturnMap(eqx.Module):
         )
 
     def each(self, x: Array) -> Array:
-        """Entries of lanes (on the first axis), or that of the only lane."""
+        """Move lanes from the last axis to the first. For a single lane, remove the axis."""
         return x if self.expected.ndim else x[0]
 
     def at_phase_of(self, system: HybridSystem) -> "ReturnMap":
-        """The map of another system; a clocked one begins at the same phase of its own clock."""
+        """The map of another system. If it is clocked, turns begin at the same phase of its own
+        clock."""
         if self.base is not None:
             return dataclasses.replace(self, system=system)
         period = jnp.asarray(system.period(), float)
@@ -234,7 +242,8 @@ class ReturnMap(eqx.Module):
         return slopes(structure, lanes.t, lanes.chart, lanes.q, u)
 
     def _structure_of(self, lanes: Lanes) -> Structure:
-        """The structure, for each piece of its turn if `lanes` are the pieces of all turns."""
+        """The structure of the system. If there are many systems and `lanes` are the pieces of all
+        turns, the structure has a copy of each system for each of its pieces."""
         turns = len(self.anchor.t)
         count = len(lanes.t)
         if turns == count:
@@ -256,8 +265,8 @@ class ReturnMap(eqx.Module):
         return lanes._replace(armed=lanes.armed & other) if self.event >= 0 else lanes
 
     def turn(self, q: Float[Array, " d"], record: Recorded | None = None) -> Return:
-        """One turn from a state on the section; by the steps of a `record`, from a state close to
-        its start."""
+        """One turn from a state on the section. With a `record`, its steps are repeated, from a
+        state close to its start."""
         s = self.structure
         u = namespace(q).zeros((self.structure.nu, 1))
 
@@ -277,9 +286,10 @@ class ReturnMap(eqx.Module):
     ) -> Turn:
         """One turn from a state on the section, with its derivatives.
 
-        **Arguments:** `record`: see `turn`. `varied`: the system with a parameter by which there
-        are derivatives, too, at the same phase of the clock (on the host). `travelled`: the turn,
-        as by `travel`, and the largest gap in it (on the host).
+        **Arguments:** `record`: see `turn`. `varied`: the system with a parameter by which
+        derivatives are taken, too, at the same phase of the clock (on the host). `travelled`: the
+        turn, if it is already known from `travel`, and the largest gap between its moves (on the
+        host).
         """
         xp = namespace(q)
         if on_host(q):
@@ -325,7 +335,7 @@ class ReturnMap(eqx.Module):
     def _linear_in_program(
         self, q: Float[Array, " d"], record: Recorded | None
     ) -> "_Linear":
-        """A turn whose pieces are linearized one after the other."""
+        """A turn whose pieces are computed and linearized one after the other."""
         s = self.structure
 
         def flow(lanes, target, h, result, piece):
@@ -356,7 +366,7 @@ class ReturnMap(eqx.Module):
         varied: Varied | None,
         travelled: tuple[Return, Any, Any] | None,
     ) -> "_Linear":
-        """A turn whose pieces are all linearized together, after it."""
+        """A turn whose pieces are linearized together, once the whole turn is known."""
         if travelled is None:
             options = Options(
                 True, new_input=False, tangents=True, at_once=varied is not None
@@ -392,7 +402,8 @@ class ReturnMap(eqx.Module):
         by: Float[np.ndarray, "K d m"],
         ends: Float[np.ndarray, "n K"],
     ) -> Float[np.ndarray, " d"]:
-        """Derivative of the end of a turn by a parameter, from those of its pieces by (t, q, u)."""
+        """Derivative of the end of a turn by a parameter, from the derivatives of its pieces by (t,
+        q, u)."""
         t0 = self.anchor.t[0]
         later = 0.0
         if self.base is None:
@@ -409,7 +420,7 @@ class ReturnMap(eqx.Module):
         return column + moved * self.slopes(end)[:, 0]
 
     def judge(self, q: Float[Array, " d"], turn: Turn) -> Int[Array, ""]:
-        """The `Result` code of a state: OK on a cycle, otherwise the reason why it is none."""
+        """The `Result` code of a state: OK if the turn is a cycle, otherwise the reason why not."""
         sizes = self.sizes
         xp = namespace(q)
         defect = self._defect(q, turn)
@@ -417,7 +428,7 @@ class ReturnMap(eqx.Module):
         counts = np.arange(self.structure.d) < existing
         singular_values = xp.where(counts, svdvals(defect), np.inf)
         smallest = xp.min(singular_values, axis=-1)
-        # (Where derivatives are large, rounding errors of the start are, too, at the end.)
+        # (Large derivatives also amplify the rounding errors of the start.)
         modulus = xp.abs(defect)
         grown = xp.max(modulus, axis=(-2, -1))
         assert self.settings.rtol is not None
@@ -443,7 +454,7 @@ class ReturnMap(eqx.Module):
         for d in range(1, self.multiplicity):
             if self.multiplicity % d:
                 continue
-            # (A cycle that closes after a part of its turns is one of lower multiplicity.)
+            # (A cycle that closes after a part of its turns has a lower multiplicity.)
             sooner = self.expected * (d / self.multiplicity)
             shorter = dataclasses.replace(self, multiplicity=d, expected=sooner)
             part = shorter.turn(q)
@@ -464,7 +475,7 @@ class ReturnMap(eqx.Module):
         return in_columns / sizes[..., None]
 
     def _rests(self, q: Float[Array, " d"], turn: Turn) -> Bool[Array, ""]:
-        """Test whether a turn stays where it begins, as at an equilibrium."""
+        """Test whether the state does not move during a turn, as at an equilibrium."""
         xp = namespace(q)
         chart = self.each(self.anchor.chart)[..., None]
         same = turn.pieces.chart == chart
@@ -477,8 +488,8 @@ class ReturnMap(eqx.Module):
         return farthest <= _REST * xp.maximum(self.settings.atol, turn.distance)
 
     def _beyond(self, turn: Turn) -> Bool[Array, "..."]:
-        """True if a guard has the sign that it has after its event at the beginnings of all pieces
-        in its chart: it was crossed by none of them, so that it was never armed."""
+        """True if a guard is below zero at the beginnings of all pieces in its chart, and no piece
+        has crossed it: it was never armed."""
         s = self.structure
         shape = turn.distance.shape
         if not any(s.guards(a) for a in range(len(s.charts))):
@@ -516,7 +527,7 @@ class ReturnMap(eqx.Module):
         fine = here & (lanes.armed | is_above)
         passed = at_any_piece(passed & xp.stack(holds))
         fine = at_any_piece(fine)
-        # (An event that happens may leave the state beyond its guard.)
+        # (An event that happens may leave its own guard below zero.)
         never_armed = passed & ~fine & ~xp.stack(fired)
         return never_armed.any(axis=0)
 
@@ -534,12 +545,13 @@ class ReturnMap(eqx.Module):
     def held(
         self, q: Float[Array, " d"], varied: Varied | None = None
     ) -> tuple[Float[Array, " d"], Float[Array, "d n"]]:
-        """The step of the state that takes conserved quantities away from their values, as far as
-        they are away, and its derivative (with the direction of the step held fixed) by the state,
-        and the parameter of `varied`.
+        """A step of the state that changes conserved quantities by their difference from the given
+        values; and its derivative by the state and the parameter of `varied` (with the direction of
+        the step held fixed).
 
-        Conserved quantities do not change along P(q) - q. So P(q) - q and this step can add up to
-        zero only if both are zero; and J - I is regular once the derivative is subtracted from it.
+        The residual of Newton's method is P(q) - q minus this step. Conserved quantities do not
+        change along P(q) - q, so that the residual is zero only if both parts are zero; and its
+        Jacobian is regular.
         """
         xp = namespace(q)
         sizes = self.sizes
@@ -568,8 +580,8 @@ class ReturnMap(eqx.Module):
         names: tuple[str, ...],
         varied: Varied | None = None,
     ) -> tuple[Float[Array, " c"], Float[Array, "c n"]]:
-        """Outputs at the anchor's time in its chart, and their derivatives by the state, and the
-        parameter of `varied`."""
+        """Outputs in the anchor's chart at the anchor's time, and their derivatives by the state
+        and the parameter of `varied`."""
         s = varied or self.structure
         t, chart, *_ = self.anchor
 
@@ -586,10 +598,11 @@ class ReturnMap(eqx.Module):
     def travel(
         self, q: Float[Array, " d"], flow: Any, record: Recorded | None = None
     ) -> tuple[Return, Any]:
-        """One turn, piece by piece, each computed by the function `flow`, and its other results;
-        or if `flow` are `Options`, one turn with these, and its pieces (see `through`).
+        """One turn, piece by piece. If `flow` is a function, it computes each piece, and its other
+        results are returned, too. If `flow` is an `Options`, `through` computes the pieces.
 
-        The pieces end at K - 1 times, then on the section on which the turn began.
+        The first K - 1 pieces end at given times, the last one on the section on which the turn
+        began.
         """
         xp = namespace(q)
         ends = self.ends()
@@ -645,7 +658,7 @@ class ReturnMap(eqx.Module):
         return lanes, tapes
 
     def ends(self) -> Target:
-        """The ends of the pieces, as lanes; of several lanes, by piece and lane."""
+        """The targets of the pieces, as lanes; for several lanes, by piece and lane."""
         t0 = self.each(self.anchor.t)
         expected = self.expected
         xp = namespace(self.expected)
@@ -692,10 +705,10 @@ def across(
     sizes: Float[Array, "K *b d"],
     factors: Float[Array, "K *b d d"],
 ) -> Float[Array, "K *b d d"]:
-    """Factors of an autonomous system on the states modulo the direction f of the flow.
+    """Factors of an autonomous system, with the direction f of the flow projected out.
 
-    Nothing contracts along the flow of an autonomous system. Projected out of every factor,
-    that direction cannot drown a strong contraction across it.
+    Along the flow of an autonomous system, deviations neither grow nor decay. If this direction
+    stayed in the factors, it would drown strong contractions across it.
     """
     project = projections(f, sizes)
     next_project = namespace(project).roll(project, -1, axis=0)
@@ -714,7 +727,8 @@ def with_derivatives(
     """Evaluate a function and its derivatives by the time, the d states and the inputs at points of
     any charts; rows and columns that a chart does not have are zero.
 
-    **Arguments:** `function`: of chart, t, q and u, as those of `engine.kernels`. `u`: Default: 0.
+    **Arguments:** `function`: a function of chart, t, q and u, like those of `engine.kernels`. `u`:
+    inputs. Default: 0.
     """
     xp = namespace(t)
     L = len(t)

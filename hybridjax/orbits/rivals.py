@@ -1,7 +1,9 @@
-"""Events of a turn that happen at the same time.
+"""Find events of a *turn* (the flow once around a cycle) that happen at the same time.
 
-One rule serves searches, sweeps, programs and routes: `rivals_of`. Where it finds rivals outside of
-programs, `coincidence.commutes` compares the orders in which they may happen.
+For each event, `rivals_of` returns a *rival*: a transition that nearby trajectories may meet before
+this event, or instead of it. All code that asks whether events coincide uses this rule: searches,
+sweeps and programs. Outside of programs, `coincidence.commutes` then compares the orders in which
+rivals may happen.
 """
 
 from typing import NamedTuple
@@ -17,20 +19,20 @@ from .return_map import ReturnMap, Turn
 
 
 class Events(NamedTuple):
-    """The events of a turn in the order of their times; those of turns side by side have the turns
-    on the last axis."""
+    """The events of a turn in the order of their times. For many turns side by side, the last axis
+    has the turns."""
 
     codes: Int[Array, "E *S"]
     """Transitions, by index; negative for none, as after the last event."""
     times: Float[Array, "E *S"]
     at_once: Bool[Array, "E *S"]
     rivals: Int[Array, "E *S"]
-    """Both as on the `Tape`."""
+    """Rivals on the `Tape`. (`at_once` is also as on the `Tape`.)"""
 
 
 def events_on(map: ReturnMap, tape: Tape) -> Events:
-    """The events on the tape of a turn, or of turns side by side, after the one with which the turn
-    begins."""
+    """The events on the tape of a turn (or of turns side by side), without the event with which the
+    turn begins."""
 
     def by_row(x):
         return stop_gradient(x.reshape(-1, *map.expected.shape))
@@ -53,7 +55,8 @@ def events_on(map: ReturnMap, tape: Tape) -> Events:
 
 
 def _after_beginning(map: ReturnMap, events: Events, begin) -> Events:
-    """The event with which a turn begins at these times, if it does, and those after it."""
+    """The events of a turn, preceded by the event with which it begins, if there is one. `begin`:
+    times of beginnings."""
     if map.event < 0:
         return events
     xp = namespace(events.times)
@@ -66,12 +69,12 @@ def _after_beginning(map: ReturnMap, events: Events, begin) -> Events:
 
 
 def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]:
-    """For each event of turns, a transition that trajectories beside the turn may meet before it,
-    or in place of it; -1 for none.
+    """For each event of turns, a transition that a trajectory near the turn may meet before this
+    event, or instead; -1 for none.
 
-    These are the event before, if it happens at the same time, a guard that comes to zero, too (see
-    `Tape.rival`), and a scheduled event that is due, but does not happen. Two scheduled events
-    happen in the same order on all trajectories.
+    The rival of an event is the event before it, if that happens at the same time; or a guard that
+    is zero at the event, too (see `Tape.rival`); or a scheduled event that is due and does not
+    happen. Two scheduled events are no rivals: they happen in the same order on all trajectories.
     """
     xp = namespace(events.times)
     codes = events.codes
@@ -99,7 +102,7 @@ def rivals_of(s: Structure, events: Events, period: Array) -> Int[Array, "E *S"]
 
 
 def is_due(s: Structure, g: int, codes, times, period) -> Bool[Array, "E *S"]:
-    """Test whether a scheduled event is due where other events leave its chart, or enter it."""
+    """Test whether a scheduled event is due at an event that leaves or enters its chart."""
     schedule = s.transitions[g].guard
     assert isinstance(schedule, Scheduled)
     source = s.transitions[g].source
@@ -112,14 +115,15 @@ def is_due(s: Structure, g: int, codes, times, period) -> Bool[Array, "E *S"]:
 
 
 def coincide(s: Structure, events: Events, period: Array) -> Bool[Array, "*S"]:
-    """Test whether events of turns coincide, so that their order may be another one beside it."""
+    """Test whether events of turns coincide, so that nearby trajectories may meet them in another
+    order."""
     return (rivals_of(s, events, period) >= 0).any(axis=0)
 
 
 def coincide_on(
     map: ReturnMap, sequence: tuple[int, ...], ends: Float[Array, "L *S"], begin, end
 ) -> Bool[Array, "E *S"]:
-    """Test which events of turns have a rival that follow an itinerary with a sequence of events.
+    """Test which events have a rival, for turns that follow an itinerary.
 
     **Arguments:** `ends`: of legs, in the order of the events. `begin`, `end`: times of the turns.
     """
@@ -141,8 +145,8 @@ def coincide_on(
 
 
 def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
-    """Two transitions of a turn, by index, that are due at the same time: the first one that
-    happens, and another one, which the turn may have passed over."""
+    """Two transitions of a turn, by index, that are due at the same time: one that happens, and
+    another one, which may not happen. None if there are none."""
     # (JAX would compile a program for each operation.)
     map, tapes, period = to_host((map, turn.tapes, turn.period))
     events = events_on(map, tapes)
@@ -156,8 +160,8 @@ def coincident(map: ReturnMap, turn: Turn) -> tuple[int, int] | None:
 
 
 def meet(map: ReturnMap, tape: Tape, period: Array) -> Bool[Array, ""]:
-    """Test whether two events of a turn coincide, in programs, where their orders are not compared:
-    an event at once follows the one before on all trajectories."""
+    """Test whether two events of a turn coincide, in programs, where orders are not compared. (An
+    event at once is no rival: it follows the event before it on all trajectories.)"""
     events = events_on(map, tape)
     rivals = rivals_of(map.structure, events, stop_gradient(period))
     return ((rivals >= 0) & ~events.at_once).any()

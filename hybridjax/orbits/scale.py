@@ -1,10 +1,13 @@
 """Sizes (characteristic magnitudes) of states, and time scales of modes.
 
-Errors are judged relative to sizes, so that no result depends on the user's units. Each name of a
-state has one size in all charts: on a cycle the state's largest modulus; before the cycle is
-computed the change that the field at the guess makes of the state in the time of its fastest mode,
-or of its clock if that is faster. If rounding errors of the field move a state by more than that,
-as they do a state that a symmetry keeps at zero, the size is large enough to tolerate them.
+Errors are measured in sizes, so that no result depends on the user's units. Searches call
+`sizes_near` before the cycle is known and `sizes_on` once it is known; `scale_of` puts sizes into
+`Settings.scale`. Each name of a state has one size in all charts. On a cycle, it is the largest
+modulus of the state. Before the cycle is known, it is the change of the state, by the field at the
+guess, in the time of the fastest mode or of the clock. A size is at least large enough that
+rounding errors of the field do not count: this matters for states that a symmetry keeps at zero.
+
+`stiff_charts` and `slow_time` estimate time scales from the eigenvalues of the field's derivative.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,10 +16,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.arguments import require_among
-from .._core.executor import is_tracer, to_host
+from .._core.executor import Array, is_tracer, to_host
 from .._core.precision import real
 from ..engine import kernels
 from ..engine.lanes import Lanes
@@ -25,24 +28,24 @@ from ..systems.structure import Structure
 
 Sizes = dict[str, float]
 
-# A size is at least this many times the error by which rounding moves the state in one period.
-# Steps are judged by errors of 1e-12 sizes, and by the change of these errors where states are
-# moved by 1e-4 sizes. Smaller: rounding shortens steps to nothing. Larger: states that are small
-# compared to what moves them lose accuracy.
+# A size is at least this many times the error that rounding causes in the state over one period.
+# (Steps have errors of 1e-12 sizes.) Smaller: rounding makes steps very short. Larger: states that
+# are small compared to their rates lose accuracy.
 _TIMES_ROUNDING = 5e13
-# Without a clock, the period in times of the fastest mode at the guess. Smaller: rounding shortens
-# steps. Larger: states at rest get sizes in which errors pass.
+# Without a clock, the assumed period, in units of the time scale of the fastest mode at the guess.
+# Smaller: rounding shortens steps. Larger: states at rest get sizes that hide errors.
 _MODES = 20.0
-# Shifts of states and of times by which rounding errors of the field show, in their rounding
-# errors: odd ones and even ones, of several sizes, since equal ones may cancel.
+# Shifts of states and times (in units of their rounding errors) at which the field is evaluated to
+# measure its rounding errors. They are odd and even, and of different magnitudes, since equal
+# shifts may cancel.
 _SHIFTS = np.array([-4.7, -3.1, -1.9, -0.8, 1.1, 2.3, 3.6, 5.2])
-# A chart is stiff if its fastest mode decays to more than this power of e in one turn. Smaller: an
+# A chart is stiff if the rate of its fastest mode, times the period, exceeds this. Smaller: an
 # implicit method is used where an explicit one is faster. Larger: explicit methods take thousands
 # of steps.
 STIFF = 1000.0
-# Rates of modes, and singular values of a factor in sizes of the states, below this part of the
-# largest are zero. Larger: slow modes and small multipliers are lost. Smaller: rounding errors are
-# taken for modes and multipliers.
+# Rates of modes, and singular values of factors (in sizes of the states), count as zero below this
+# part of the largest one. Larger: slow modes and small multipliers are lost. Smaller: rounding
+# errors are taken for modes and multipliers.
 ROUNDING = 1e-9
 
 
@@ -51,16 +54,17 @@ class GuessSizes(NamedTuple):
 
     sizes: Sizes
     time: float
-    """Time scale of the states: one over the rate of the fastest mode, or over the clock's if that
-    is faster."""
+    """Time scale of the states: the inverse of the rate of the fastest mode, or of the clock's
+    angular frequency if that is larger."""
     points: Float[np.ndarray, "A d"]
-    """A state in every chart that resets lead to; NaN in the others."""
+    """A state in every chart to which resets lead; NaN in other charts."""
 
 
 def sizes_near(
     s: Structure, chart: int, t: float, q: Float[np.ndarray, " d"], period: float | None
 ) -> GuessSizes:
-    """Sizes of all states, from the field at a guess and at the states that resets make of it.
+    """Sizes of all states, from the field at a guess, and at the states after resets from the
+    guess.
 
     **Arguments:** `chart`, index of the guess's chart; `q`, padded; `period` of the clock.
     """
@@ -72,7 +76,7 @@ def sizes_near(
     reached = np.roll(reached, -place_of_guess)
     R = len(reached)
 
-    # Of the clock's phases an odd number, since an even one may repeat a symmetry.
+    # An odd number of phases of the clock, since an even number may coincide with a symmetry.
     phases = np.zeros(1)
     if period is not None:
         phases = period * np.arange(7) / 7
@@ -108,6 +112,20 @@ def sizes_on(s: Structure, lanes: Lanes, period: float) -> Sizes:
     return _by_name(s, chart, size)
 
 
+def in_sizes(
+    matrix: Float[Array, "*L n d"],
+    sizes: Float[Array, "*L d"],
+    after: Float[Array, "*L n"] | None = None,
+) -> Float[Array, "*L n d"]:
+    """A matrix of derivatives of states by states, in units of their sizes.
+
+    **Arguments:** `sizes` of the states by which the derivative is taken; `after`, sizes of the
+    states whose derivative it is. Default: the same.
+    """
+    rows = sizes if after is None else after
+    return matrix * sizes[..., None, :] / rows[..., :, None]
+
+
 def given_sizes(s: Structure, scale: Mapping[str, float] | None) -> Sizes:
     """Sizes by name, as users give them.
 
@@ -122,8 +140,8 @@ def scale_of(
     sizes: Mapping[str, float],
     otherwise: Float[ArrayLike, "A d"] | None = None,
 ) -> Float[Array, "A d"]:
-    """Sizes by chart, padded, as in `Settings.scale`. States whose names are not among the `sizes`
-    take those of another such array, or 1."""
+    """Sizes by chart, padded, as in `Settings.scale`. States that are not named in `sizes` get
+    their entry of a default array, or 1."""
     scale = np.full((len(s.charts), s.d), np.nan)
     for a, chart in enumerate(s.charts):
         for row, name in enumerate(chart.states):
@@ -149,7 +167,7 @@ def sizes_of(s: Structure, scale: Float[Array, "A d"]) -> Sizes:
 
 def stiff_charts(s: Structure, pieces: Lanes, period: float) -> dict[str, float]:
     """The charts with explicit methods that are stiff on a cycle, each with the rate of its fastest
-    mode. `pieces`: states at equal distances in time, of a turn in this period."""
+    mode. `pieces`: states at equal distances in time along one period."""
     stiff = {}
     step = period / len(np.ravel(pieces.t))
     for a, t, q in points(s, pieces):
@@ -163,7 +181,7 @@ def stiff_charts(s: Structure, pieces: Lanes, period: float) -> dict[str, float]
 def fastest(
     s: Structure, a: int, t: Float[np.ndarray, " P"], q: Float[np.ndarray, "n P"]
 ) -> Float[np.ndarray, " P"]:
-    """The rates at which the fastest modes of chart a decay; 0 if none does."""
+    """The rates at which the fastest modes of chart a decay; 0 if no mode decays."""
     rates = np.real(_modes(s, a, t, q))
     return -rates.min(axis=1, initial=0.0)
 
@@ -197,7 +215,8 @@ def slow_time(s: Structure, t: float, states: Float[np.ndarray, "A d"]) -> float
 
 
 def points(s: Structure, pieces: Lanes) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Charts, times and states at the beginnings of the pieces of a turn, until it failed."""
+    """Iterate over charts, times and states at the beginnings of the pieces of a turn, up to the
+    piece that failed."""
     t = np.asarray(pieces.t)
     chart = np.asarray(pieces.chart)
     q = np.asarray(pieces.q)
@@ -226,7 +245,7 @@ class _Fields(NamedTuple):
     derivative: Float[np.ndarray, "d d K"]
     """Derivative of the field with respect to the state."""
     rounding: Float[np.ndarray, "d K"]
-    """Change of the field by rounding errors, at states and times that all but agree."""
+    """Change of the field by rounding errors, from states and times that differ by rounding."""
 
 
 def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
@@ -267,10 +286,11 @@ def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
     error = np.abs(values - f[..., None] - smooth)
     in_state, in_time = np.split(error, [1 + len(_SHIFTS)], axis=-1)
 
-    # (Rounding of time itself, as in a phase omega * t, is no error of the field.)
+    # (The rounding error of the time itself, as in a phase omega * t, is not counted.)
     of_time = 2 * np.finfo(float).eps * np.abs(by_time * t)
     in_time = in_time - of_time[..., None]
-    # A field that jumps with the clock jumps on one side of a time only: earlier, or later.
+    # If the field jumps with the clock near a time, only the shifts to one side of this time see
+    # the jump.
     earlier, later = np.split(in_time, 2, axis=-1)
     with_earlier = earlier.max(axis=-1)
     with_later = later.max(axis=-1)
@@ -292,7 +312,7 @@ def _shifted(t: Float[np.ndarray, " K"], q: Float[np.ndarray, "n K"]):
     of_time = np.concatenate([[0.0], none, _SHIFTS])
     of_states = []
     for k in range(len(q)):
-        # (Not all states by the same part, which may cancel.)
+        # (States get different shifts, since equal ones may cancel.)
         shifts = np.roll(_SHIFTS, k)
         of_states.append(np.concatenate([[0.0], shifts, none]))
     parts = 1 + eps * np.array(of_states)
@@ -302,7 +322,7 @@ def _shifted(t: Float[np.ndarray, " K"], q: Float[np.ndarray, "n K"]):
 
 
 def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
-    """A state in every chart, by resets from the guess's; NaN in charts that none leads to."""
+    """A state in every chart, by resets from the guess; NaN in charts to which no reset leads."""
     states = np.full((len(s.charts), s.d), np.nan)
     states[chart] = q
     reached = {chart}
@@ -322,8 +342,9 @@ def _reached(s: Structure, chart: int, t: float, q) -> Float[np.ndarray, "A d"]:
 
 
 def _time_scale(q: Float[np.ndarray, "d K"], near: _Fields) -> float:
-    """The time of the fastest mode of the field's derivative at the first point that has one (the
-    guess comes first); in free flight, the time in which a state changes by its size."""
+    """The time scale of the fastest mode of the field's derivative, at the first point that has a
+    mode (the guess comes first). If there is none, as in free flight, the time in which a state
+    changes by its own magnitude."""
     for derivative in np.moveaxis(near.derivative, -1, 0):
         modes = np.linalg.eigvals(derivative)
         fastest_rate = np.max(np.abs(modes))
@@ -343,7 +364,7 @@ def _time_scale(q: Float[np.ndarray, "d K"], near: _Fields) -> float:
 def _by_name(
     s: Structure, chart: Int[np.ndarray, " K"], size: Float[np.ndarray, "d K"]
 ) -> Sizes:
-    """The largest size of each state in any chart; 1 for one that is zero everywhere."""
+    """The largest size of each state in any chart; 1 for a state that is zero everywhere."""
     sizes = dict.fromkeys(s.state_names(), 0.0)
     for a, column in zip(chart, size.T, strict=True):
         states = s.charts[a].states

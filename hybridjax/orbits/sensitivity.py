@@ -3,6 +3,9 @@
 A parameter is an input of frequency 0. The change of the shape at equal phases is the infinitesimal
 shape response curve, and the changes of the times between events are local timing responses (Y.
 Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
+
+`LimitCycle.sensitivity` calls `sensitivity`. `_sensitivity` drives the linear flow of the cycle
+(`linear_flow.py`) with a constant input, and closes it over one period (`responses.loop`).
 """
 
 from typing import Any
@@ -26,6 +29,7 @@ from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
 from .responses import Phases, loop
 from .return_map import SINGULAR, ReturnMap, with_derivatives
+from .scale import in_sizes
 
 
 @checked_methods
@@ -36,9 +40,9 @@ class Sensitivity(Showable, eqx.Module):
 
     - `parameter`: its name. `period`: derivative of the period.
     - `events`: names of the events of one period, from phase 0 on. `times` (E,): derivatives of
-        their times, which are those of the clock, or count from phase 0 if there is none.
-        `durations` (E,): derivatives of the time from each event to the next, and from the last to
-        the first.
+      their times. (Times are those of the clock, or count from phase 0 if there is no clock.)
+      `durations` (E,): derivatives of the time from each event to the next, and from the last to
+      the first.
     """
 
     parameter: str = eqx.field(static=True)
@@ -53,7 +57,7 @@ class Sensitivity(Showable, eqx.Module):
     change: Float[Array, "P K d"]
 
     def shape(self, phase: Phases) -> dict[str, Float[Array, " p"]]:
-        """Derivatives of the states at equal phases, by name; NaN in charts that lack one."""
+        """Derivatives of the states at equal phases, by name; NaN in charts that lack the state."""
         require_as_made(self.structure.system, "these derivatives were computed")
         chart, states = self.flow.at(phase, self.duration, self.change)
         return by_name(self.structure, chart, states)
@@ -97,10 +101,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     longer = -(Z @ total[:, 0])
     if clocked:
         longer = map.multiplicity * kernels.by_parameter_of_period(varied)
-        if (
-            on_host(whole)
-            and svdvals(closed * map.sizes / map.sizes[:, None])[-1] < SINGULAR
-        ):
+        if on_host(whole) and svdvals(in_sizes(closed, map.sizes))[-1] < SINGULAR:
             raise ComputationError(
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
@@ -134,8 +135,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
 def section_delay(
     map: ReturnMap, f: Float[Array, " d"], parameter: str | None = None
 ) -> tuple[Float[Array, " d"], Array]:
-    """The time by which a changed state at phase 0 comes later to the section, per change of the
-    state and of the first input."""
+    """Derivatives of the time of arrival at the section, by the state at phase 0 and by the first
+    input."""
     assert map.base is not None
     levels = ListLevels((map.base,))
     index = np.zeros(1, np.int32)

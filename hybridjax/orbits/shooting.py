@@ -1,15 +1,16 @@
-"""Newton's method on the starts of all moves (steps and events) of a turn, on the host.
+"""Newton's method on the starts of all moves of a turn at once, on the host.
 
-Near a turn that was recorded, all moves of the next one are computed side by side: first without
-decisions (`fixed_point`), then as the search would make them (`travel`). This takes a few calls of
-the kernels instead of one after the other for every step. (Multiple shooting: H. G. Bock and K. J.
-Plitt, IFAC Proceedings 17, 1984.)
+A *turn* is the flow from the section back to it, and a *move* is a step of it with the event at its
+end. If a nearby turn was recorded, all its moves are computed side by side from other starts:
+`fixed_point` changes the starts until the moves join to a cycle; `travel` then makes each move by
+the search, to see that it is still right. This needs few calls of compiled functions, instead of
+one call for every step. (Multiple shooting: H. G. Bock and K. J. Plitt, IFAC Proceedings 17, 1984.)
 
-A wrong Newton step comes from `_changes`. A turn that is refused without need comes from
-`_forwards` (a move would end before it starts), from `_searched` (a move fails, or does not lead to
-the chart, the armed guards or the number of events with which the next one begins), or from
-`travel` (gaps). `newton.py`, `curve.py` and `batches.py` call this file, and so do sections that
-follow recorded moves.
+A wrong Newton step comes from `_changes`. If a turn is refused without need, there are three
+places: `_forwards` (a move would have a negative duration), `_searched` (a move fails, or ends in
+another chart or with other armed guards than the next one begins), and `travel` (gaps between
+moves). `newton.py`, `curve.py` and `batches.py` call this file, and so do sections that follow
+recorded moves.
 """
 
 import dataclasses
@@ -28,11 +29,11 @@ from ..engine.search.attempt import deviation
 from ..engine.search.state import Stride
 from ..engine.target import Target, until
 from .return_map import CLOSED, PIECES, SINGULAR, Return, ReturnMap
-from .scale import has_implicit
+from .scale import has_implicit, in_sizes
 
 
-# Newton's method ends with a step below this, in sizes of the states and relative to the state.
-# Larger: it ends one step too early. Smaller: rounding keeps it from ending.
+# Newton's method ends with a step below `ATOL` (in sizes, the magnitudes of the states) plus `RTOL`
+# times the state. Larger: it ends one step too early. Smaller: rounding keeps it from ending.
 ATOL = 1e-12
 RTOL = 1e-11
 
@@ -42,8 +43,8 @@ def newton_steps(
     residual: Float[np.ndarray, "S n"],
     rcond: float = SINGULAR,
 ) -> Float[np.ndarray, "S n"]:
-    """Newton steps of S systems of equations, on the host: the shortest ones for singular systems,
-    NaN for systems that are not finite."""
+    """Newton steps of S systems of equations, on the host. For a singular system, the step of least
+    norm; for a system that is not finite, NaN."""
     step = np.full(residual.shape, np.nan)
     good = np.isfinite(residual).all(axis=1)
     good = good & np.isfinite(jacobian).all(axis=(1, 2))
@@ -55,7 +56,7 @@ def newton_steps(
 def excess(
     q: Float[np.ndarray, "S d"], step: Float[np.ndarray, "S d"]
 ) -> Float[np.ndarray, " S"]:
-    """The largest part of each step relative to the tolerance of Newton's method, in sizes."""
+    """The largest entry of each step relative to the tolerance of Newton's method. All in sizes."""
     tolerance = ATOL + RTOL * np.abs(q)
     return np.max(np.abs(step) / tolerance, axis=1)
 
@@ -63,12 +64,13 @@ def excess(
 def fixed_point(
     map: ReturnMap, turn: tuple[Lanes, Tape], otherwise: Float[np.ndarray, " d"]
 ) -> tuple[Float[np.ndarray, " d"], Moves | None]:
-    """The state, in sizes, from which a turn with the recorded moves returns to itself, and these
-    moves, if all last forwards; `otherwise` and no moves, if steps do not halve each time.
+    """The state, in sizes, from which a turn with the recorded moves returns to itself, and the
+    moves from there. If Newton's steps do not halve each time, or a move would have a negative
+    duration: `otherwise`, and None.
 
     **Arguments:** `turn`: the pieces of a turn and their tapes, side by side.
 
-    Guards are not watched here: `travel` tests whether the moves are still right.
+    Guards are not evaluated here: `travel` tests whether the moves are still right.
     """
     sizes = map.sizes
     target = map.ends()
@@ -89,7 +91,8 @@ def fixed_point(
         t = moves.t + shift[:, 0]
         q = moves.q + moved.T
         moves = moves._replace(t=t, q=q, h=h)
-        # (The error after a step is about its square.)
+        # (Newton's method converges quadratically: after a step, the error is about the square of
+        # the step.)
         rtol = np.asarray(map.settings.rtol)
         if length <= np.maximum(CLOSED, rtol):
             return x, _forwards(moves)
@@ -99,8 +102,8 @@ def fixed_point(
 def _shift(
     map: ReturnMap, moves: Moves, x: Float[np.ndarray, " d"], target: Target
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "M n"], Float[np.ndarray, " M"]]:
-    """The Newton step of the state at the anchor, in sizes, the changes of (t, q) where moves start
-    that close the gaps between moves, and the lengths of the moves after them."""
+    """One Newton step: of the state at the anchor (in sizes), of (t, q) at the starts of moves, so
+    that the gaps between moves close, and of the lengths of moves."""
     n = 1 + len(x)
     end, by = linear_moves(map.structure, moves, target)
     by_point = by[:, :, :n]
@@ -122,11 +125,11 @@ def _shift(
 def _changes(
     by: Float[np.ndarray, "M n n"], gaps: Float[np.ndarray, "M n"], late: float
 ) -> Float[np.ndarray, "1+M n n"]:
-    r"""Changes of (t, q) where moves start, and at the end of the last one.
+    r"""Changes of (t, q) at the starts of moves, and at the end of the last move.
 
-    The columns are derivatives by the state at the first start; the last column is the change that
-    closes all gaps, of which the first is a time, `late`. With the derivatives $B_k$ of a move and
-    the gap $g_k$ behind it, $C_{k+1} = B_k C_k$, and $c_{k+1} = B_k c_k + g_k$ in the last column.
+    The first columns C are derivatives by the state at the first start. The last column c is the
+    change that closes all gaps; `late` is the gap in time at the first start. With the derivative
+    $B_k$ of move k and the gap $g_k$ after it, $C_{k+1} = B_k C_k$ and $c_{k+1} = B_k c_k + g_k$.
     """
     n = by.shape[1]
     change = np.eye(n, k=-1)
@@ -153,16 +156,16 @@ def _step_of(
     by_start = np.where(valid, end[:, :-1], 0.0)
     residual = returned - q - off
     jacobian = by_start - np.eye(len(x)) - held
-    in_sizes = jacobian * sizes / sizes[:, None]
-    (step,) = newton_steps(in_sizes[None], (residual / sizes)[None])
+    scaled = in_sizes(jacobian, sizes)
+    (step,) = newton_steps(scaled[None], (residual / sizes)[None])
     return step
 
 
 def _forwards(moves: Moves) -> Moves | None:
-    """The moves, all of which last forwards.
+    """The moves, without any of negative duration.
 
-    Where a move would end before it starts, the move before it goes to its end instead. None if
-    that one ends with an event, or belongs to another piece.
+    If a move would end before it starts, it is joined with the move before it. None if the move
+    before ends with an event or belongs to another piece.
     """
     back = np.flatnonzero(moves.h < 0)
     is_first = moves.order[back] == 0
@@ -180,8 +183,8 @@ def _forwards(moves: Moves) -> Moves | None:
 
 
 def travel(map: ReturnMap, q: Float[np.ndarray, " d"], expected: Moves) -> tuple | None:
-    """A turn, as by `ReturnMap.travel`, and the largest gap between its moves, in sizes of the
-    states; None if it has other moves than expected."""
+    """A turn, in the form of `ReturnMap.travel`, and the largest gap between its moves in sizes of
+    the states. None if a search makes other moves than expected."""
     followed = follow_moves(map, map.departure(q), map.ends(), expected)
     if followed is None:
         return None
@@ -212,13 +215,13 @@ def one_by_one(x: np.ndarray) -> np.ndarray:
 def follow_moves(
     map: ReturnMap, begin: Lanes, ends: Target, expected: Moves
 ) -> tuple | None:
-    """The flow to one of the `ends` after the other, where its moves are known but for rounding:
-    each is a lane of one search. None if one does not end as the next one begins.
+    """The flow to the `ends` one after the other, if its moves are known up to rounding: all moves
+    are computed side by side by one search. None if a move does not end as the next one begins.
 
-    **Arguments:** `expected`: moves whose `lane` is the piece.
+    **Arguments:** `expected`: the moves; their `lane` is the number of the piece.
 
-    **Returns:** by piece the lanes before, their ends, and the tape; and the largest gap between
-    moves, in sizes of the states.
+    **Returns:** for each piece the lane before, the lane at the end, and the tape; and the largest
+    gap between moves in sizes of the states.
     """
     moves = expected
     lanes = _starts(map, begin, moves)
@@ -233,14 +236,14 @@ def follow_moves(
     last = after_last - 1
     pieces = jax.tree_util.tree_map(lambda x: x[..., first], lanes)
     moved = jax.tree_util.tree_map(lambda x: x[..., last], moved)
-    # (Moves on the way to an end are lanes here, each to a time that is known.)
+    # (Here each move is a lane of its own, which ends at a known time.)
     on_the_way = (tape.code == ARRIVE_TIME) & (moves.code == MOVE)
     tape = tape._replace(code=np.where(on_the_way, MOVE, tape.code))
     return pieces, moved, regrouped(tape, moves.lane, pieces), gap
 
 
 def _starts(map: ReturnMap, begin: Lanes, moves: Moves) -> Lanes:
-    """Lanes where moves start; the first one is that with which the turn begins."""
+    """Lanes at the starts of moves. The first one is the beginning of the turn."""
     s = map.structure
     charts = moves.chart.astype(np.int32)
     lanes = start_lanes(s, moves.t, charts, moves.q)
@@ -253,7 +256,7 @@ def _starts(map: ReturnMap, begin: Lanes, moves: Moves) -> Lanes:
 
 
 def _targets(moves: Moves, ends: Target) -> Target:
-    """The targets of moves: a time where the next move starts, or an end of a piece."""
+    """The targets of moves: the time at which the next move starts, or the end of a piece."""
     code = moves.code
     piece = moves.lane
     next_start = np.append(moves.t[1:], np.inf)
@@ -277,14 +280,14 @@ def _targets(moves: Moves, ends: Target) -> Target:
 def _searched(
     map: ReturnMap, lanes: Lanes, moves: Moves, target: Target, ends: Target
 ) -> tuple[Lanes, Any, Tape] | None:
-    """The lanes with the guards that are armed where they start, their ends, and the tape; None if
-    one fails, or does not end as the next one begins."""
+    """The lanes at the starts of moves, with their armed guards; the lanes at the ends; and the
+    tape. None if a move fails, or does not end as the next one begins."""
     s = map.structure
     setout = _setout(map, lanes, moves, target, ends)
     u = np.zeros((s.nu, len(moves.code)))
     options = Options(True, new_input=False, tangents=True)
     here = belongs(s, lanes.chart)[:-1, 1:]
-    # (Twice: guards that a move arms are armed where the next one starts.)
+    # (Twice: the first search tells which guards are armed at the start of each move.)
     for _ in range(2):
         moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
         end = moved.lanes
@@ -310,7 +313,8 @@ def _setout(
     map: ReturnMap, lanes: Lanes, moves: Moves, target: Target, ends: Target
 ) -> Stride:
     """The first steps of moves."""
-    # (Longer ones: rounding may divide those to a known time; a crossing is met within a step.)
+    # (First steps are longer than the moves: otherwise rounding might divide a move in two, and a
+    # crossing must lie within the step.)
     to_time = np.where(moves.h > 0, 2 * moves.h, map.expected)
     is_to_time = np.isfinite(target.time)
     h = np.where(is_to_time, to_time, 1.01 * moves.h)
@@ -318,8 +322,8 @@ def _setout(
     s = map.structure
     if not has_implicit(s):
         return setout
-    # (The deviation of a move is that of the move before, carried along, where no piece or event
-    # ended between the two.)
+    # (The deviation of a move is that of the move before, unless a piece or an event ended in
+    # between.)
     along = deviation(s, lanes, map.settings)
     _, by = linear_moves(s, moves, ends)
     by_state = by[:, 1:, 1 : 1 + s.d]

@@ -1,16 +1,18 @@
 """Checks of a limit cycle that was found: `verdict`.
 
-Newton's method shows only that a computed return map has a fixed point. The verdict walks along the
-cycle once more, by another method with other steps (`walk.py`), from each of the points that the
-first integration left, and tests what that integration assumed.
+Newton's method shows only that a computed return map has a fixed point. The verdict integrates
+along the cycle once more, by another method with other steps. This second integration is called the
+*walk* (`walk.py`). It begins at each recorded point of the first integration, and ends at the next
+one. Searches, sweeps and branches call `verdict`; its `findings` refuse a cycle, or warn. *Sizes*
+of states are their magnitudes, and a *visit* is the stay in one chart between two events.
 
-It sees: pieces of the cycle that are not trajectories of the vector field; events at which the
-guard is not zero, or is not crossed in its direction; guards that the cycle passes, or lies beyond
-all along, without an event; scheduled events that were left out; a period that is a multiple of the
-shortest; multipliers that differ from those of the walk, or that only rounding decides on. It does
-not see: a guard that dips below zero and back between two of its points (eight in each step),
-whether functions mean what their author meant, and multipliers of systems with more than `_MANY`
-states.
+The verdict notices pieces of the cycle that are not trajectories of the vector field; events at
+which the guard is not zero, or is not crossed in its direction; guards that the cycle crosses
+without an event, or below which it always lies; scheduled events that were left out; a period that
+is a multiple of the shortest one; multipliers that differ from those of the walk, or that are
+rounding errors. It does not notice a guard that dips below zero and back between two points of the
+walk (eight in each step), wrong multipliers of systems with more than `_MANY` states, or functions
+that do not mean what their author meant.
 """
 
 from collections.abc import Iterable
@@ -36,32 +38,34 @@ from .return_map import turn_product
 from .walk import ROUGH, Stretch, Walked, walk
 
 
-# Largest distance, in sizes of the states, between the walk and a point of the cycle; of cycles
-# that are computed with larger errors, `_STEPS` times the error of a step. Larger: wrong cycles
-# pass. Smaller: errors of steps that add up are taken for faults.
+# Largest allowed distance between the walk and a point of the cycle, in sizes of the states. (If
+# the cycle was computed with larger errors: `_STEPS` times the error of a step.) Larger: wrong
+# cycles pass. Smaller: errors of steps that add up are taken for faults.
 _APART = 1e-6
 _STEPS = 1e4
-# Largest difference of sums of powers of multipliers of the two integrations, relative to their
-# size. Larger: a wrong multiplier passes. Smaller: errors of the walk are taken for faults.
+# Largest allowed difference between sums of powers of the multipliers of the two integrations,
+# relative to these sums. Larger: a wrong multiplier passes. Smaller: errors of the walk are taken
+# for faults.
 _DIFFERENT = 1e-4
-# Largest difference of the product of all multipliers from that of the determinants of all moves,
-# relative to it; of cycles with larger errors, `_STEPS` times the error of a step.
-# Larger: multipliers that are only rounding pass. Smaller: errors of the walk are taken for faults.
+# Largest allowed relative difference between the product of all multipliers and the product of the
+# determinants of all moves. (If the cycle was computed with larger errors: `_STEPS` times the error
+# of a step.) Larger: multipliers that are only rounding pass. Smaller: errors of the walk are taken
+# for faults.
 _OTHER_PRODUCT = 1e-6
-# The least product of multipliers that is compared. Smaller: those that are nearly zero, of which
-# only the size is known, are taken for faults. Larger: fewer cycles are compared.
+# Products of multipliers are compared if they are at least this. Smaller: products that are nearly
+# zero, of which only the magnitude is known, count as faults. Larger: fewer cycles are compared.
 _LEAST_PRODUCT = 1e-6
-# A guard is beyond zero if its value exceeds the change that deviations of this size, in sizes of
-# the states, could make. Larger: shallow excursions pass. Smaller: errors of the walk count.
+# A guard counts as negative if a change of each state by this part of its size could not make the
+# guard positive. Larger: shallow excursions pass. Smaller: errors of the walk count.
 _BEYOND = 1e-6
-# The same for the time of an event, as a part of the period. Larger: an event beside its guard
-# passes. Smaller: rounding errors of times are called faults.
+# An event may be this part of the period away from the zero of its guard. Larger: an event near its
+# guard passes. Smaller: rounding errors of times count as faults.
 _LATE = 1e-10
-# The shortest visit of a chart, in periods, in which guards are watched. Shorter: rounding decides
-# on the side of guards between events that nearly coincide.
+# The shortest visit of a chart, in periods, in which guards are tested. Shorter: between events
+# that nearly coincide, the signs of guards are decided by rounding.
 _SHORT = 1e-9
-# A cycle that runs several times around closes after a part 1/p of its period for a prime number p.
-# More: the verdict takes longer.
+# A cycle that runs several times around closes after a part 1/p of its period, with p one of these
+# primes. More: the verdict takes longer.
 _PRIMES = 2, 3, 5, 7
 # Largest number of states with which multipliers are compared. Larger: derivatives of the walk take
 # longer than the search.
@@ -117,14 +121,15 @@ class Verdict(NamedTuple):
 
 
 def require_sound(cycle: Any) -> None:
-    """**Raises:** `DefinitionError` for a cycle with a fault, from which others would have it."""
+    """**Raises:** `DefinitionError` for a cycle with a fault, before other cycles are computed from
+    it."""
     for finding in verdict(cycle).refused:
         raise DefinitionError(f"the cycle that is the guess is none: {finding.text}")
 
 
 class _Path(NamedTuple):
-    """The walk along a cycle, in moves: pieces from one point that the first integration left to
-    the next, each without an event on its way."""
+    """The walk along a cycle, in moves. A move leads from one recorded point of the first
+    integration to the next, without an event in between."""
 
     t: Float[np.ndarray, " M+1"]
     """Times of the beginnings of moves, and of the end of the turn."""
@@ -137,7 +142,8 @@ class _Path(NamedTuple):
     """Largest distance to the cycle, in sizes of the states."""
     monodromy: Float[np.ndarray, "d d"]
     volume: float
-    """Product of the determinants of all moves; 0 where charts have other numbers of states."""
+    """Product of the determinants of all moves; 0 if the number of states differs between
+    charts."""
     findings: list[Finding]
     """Faults at events."""
 
@@ -148,13 +154,13 @@ class _Path(NamedTuple):
 
 
 class Visit(NamedTuple):
-    """A stay in a chart between two events, or a whole turn without any."""
+    """The stay in a chart between two events, or a whole period without events."""
 
     chart: int
     t: Float[np.ndarray, " P"]
     q: Float[np.ndarray, "n P"]
     event: int
-    """The transition at its end, by index; -1 for none."""
+    """The transition at the end of the visit, by index; -1 for none."""
 
 
 _verdicts = Memory()
@@ -222,7 +228,7 @@ def _walk_along(cycle) -> _Path:
     moves = recorded_moves(*last_turn(cycle))
     t = np.append(moves.t, moves.t[0] + float(cycle.period))
     event = np.maximum(moves.code, -1)
-    # (A short move is known to more digits than the times of its ends.)
+    # (The length of a short move is known to more digits than the times of its ends.)
     between = np.diff(t)
     rounding = 1e-14 * np.abs(t[1:])
     same = np.abs(moves.h - between) <= rounding
@@ -248,7 +254,7 @@ def _walk_along(cycle) -> _Path:
         at = time, int(chart[k]), q[:, k]
         span = float(cycle.period)
         jumped = _jump(s, int(event[k]), *at, scale, span, at_once)
-        # (The event before one at once has brought this about, and has delayed it.)
+        # (An event at once is caused by the event before it, and delayed by the same time.)
         before = k - 1 if at_once else k
         if not at_once:
             delay = jumped.delay @ by_state[k]
@@ -269,7 +275,7 @@ def _walk_along(cycle) -> _Path:
 
 
 def _distance(s: Structure, scale, ends: tuple, points: tuple) -> float:
-    """Largest distance between ends of moves and the points where the moves after them begin."""
+    """Largest distance between the end of a move and the beginning of the next one."""
     chart, q = ends
     next_chart, begin = points
     if (chart != next_chart).any():
@@ -289,7 +295,7 @@ class _Jump(NamedTuple):
     """An event on the way, padded. Scheduled events have no delay."""
 
     chart: int
-    """After the event, as `q`."""
+    """Chart after the event; `q` is the state after it."""
     q: Float[np.ndarray, " d"]
     by_state: Float[np.ndarray, "d d"]
     """Derivative of the reset."""
@@ -303,8 +309,8 @@ class _Jump(NamedTuple):
 def _jump(
     s: Structure, g: int, t: float, a: int, q, scale, span: float, at_once: bool = False
 ) -> _Jump:
-    """Event g of a state of chart a, at its own time; or `at_once` after another event, which has
-    led to this state, where its guard is at zero, or beyond. `span`: the period."""
+    """Event g at a state of chart a. With `at_once`, another event has led to this state, and the
+    guard of event g is zero or below zero there. `span`: the period."""
     transition = s.transitions[g]
     n = s.dims[a]
     u = np.zeros((s.nu, 1))
@@ -322,7 +328,7 @@ def _jump(
         else:
             delay[:n] = event.delay_by_state[0]
             rate = event.rate[0]
-            # (A guard that depends on the time alone has no noise of states.)
+            # (A guard that depends on the time alone does not change with the states.)
             noise = noise + abs(rate) * _LATE * span
             findings = _off_guard(transition, t, level, rate, noise)
     m = event.after.shape[1]
@@ -344,7 +350,7 @@ def _jump(
 
 
 def _noise(slope: Float[np.ndarray, "n ..."], sizes: Float[np.ndarray, " n"]):
-    """The change of a guard that deviations of the size `_BEYOND` make."""
+    """The change of a guard by deviations of the relative size `_BEYOND`."""
     return _BEYOND * np.tensordot(sizes, np.abs(slope), axes=1)
 
 
@@ -358,7 +364,8 @@ def _off_guard(
 
 
 def _not_due(transition, t: float, level: float, noise: float) -> list[Finding]:
-    """A finding on an event at once after another one that has not led to or beyond its guard."""
+    """A finding on an event at once, if the event before it has not led to zero or below zero of
+    its guard."""
     if level > 10 * noise:
         return [_without_guard(transition, t, level, -1.0)]
     return []
@@ -387,7 +394,8 @@ def _off_schedule(transition, t: float) -> list[Finding]:
 
 
 def _visits(s: Structure, path: _Path) -> list[Visit]:
-    """The visits of charts on the cycle; one that the beginning of the turn divides is whole."""
+    """The visits of charts on the cycle. A visit that the beginning of the turn would divide is
+    kept whole."""
     M = len(path.event)
     period = path.t[-1] - path.t[0]
     visits = []
@@ -417,8 +425,8 @@ def _visits(s: Structure, path: _Path) -> list[Visit]:
 
 
 def _moves_of_visits(event: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " m"]]:
-    """The moves of each visit, up to the one that ends with its event. The first visit may begin
-    before the turn, at negative indices."""
+    """The moves of each visit. The last one ends with the event of the visit. The first visit may
+    begin before the turn, at negative indices."""
     ends = np.flatnonzero(event >= 0)
     if not len(ends):
         return [np.arange(len(event))]
@@ -428,7 +436,7 @@ def _moves_of_visits(event: Int[np.ndarray, " M"]) -> list[Int[np.ndarray, " m"]
 
 
 def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
-    """Guards at the points of a visit, with zero for what may be an error of the walk."""
+    """Guards at the points of a visit. Values that may be errors of the walk are set to zero."""
     a = visit.chart
     n = len(visit.q)
     if not s.guards(a):
@@ -445,9 +453,9 @@ def _levels(s: Structure, visit: Visit, scale) -> Float[np.ndarray, "G P"]:
 def _beyond_guards(
     s: Structure, visits: list[Visit], never: set[int], scale
 ) -> Iterable[Finding]:
-    """Guards of events that never happen, and beyond which the cycle lies in all of its visits.
+    """Guards that are below zero in all visits of the cycle, although their event never happens.
 
-    An event that happens may leave the state beyond its guard.
+    (An event that happens may leave its guard below zero.)
     """
     for a in {visit.chart for visit in visits}:
         here = [visit for visit in visits if visit.chart == a]
@@ -464,10 +472,10 @@ def _beyond_guards(
 
 
 def _passed_guards(s: Structure, visit: Visit, scale) -> Iterable[Finding]:
-    """Guards that a visit passes without an event."""
+    """Guards that fall through zero during a visit without an event."""
     levels = _levels(s, visit, scale)
     for k, g in enumerate(s.guards(visit.chart)):
-        # (At the end of a visit the guard of its own event is zero up to errors.)
+        # (At the end of a visit, the guard of the event that ends it is zero up to errors.)
         level = levels[k, :-1] if g == visit.event else levels[k]
         for point in _crossings(level):
             if _may_happen(s, g, _at_zero(visit, level, point), np.array([0])):
@@ -484,8 +492,8 @@ def _crossings(level: Float[np.ndarray, " P"]) -> Int[np.ndarray, " n"]:
 
 
 def _at_zero(visit: Visit, level: Float[np.ndarray, " P"], point: int) -> Visit:
-    """The point of a visit at which a guard, which is negative at `point`, has passed zero: on the
-    chord from the point where it was positive."""
+    """The point of a visit at which a guard has passed zero, by linear interpolation between the
+    point `point`, where it is negative, and the point before."""
     before = int(np.flatnonzero(level[:point])[-1])
     part = level[before] / (level[before] - level[point])
     step = visit.t[point] - visit.t[before]
@@ -623,7 +631,7 @@ def _long_clock(cycle, path: _Path) -> list[Finding]:
 
 
 def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
-    """Those of `parts` for which the cycle closes after its period, divided by them."""
+    """The numbers p in `parts` for which the cycle closes after the part 1/p of its period."""
     if not parts:
         return []
     map = cycle.return_map
@@ -647,13 +655,14 @@ def _closing_parts(cycle, path: _Path, parts: list[int]) -> list[int]:
 
 
 def _apart(cycle, monodromy: Float[np.ndarray, "d d"]) -> float:
-    """Largest difference between the traces of powers of two monodromy matrices: that of the cycle
-    and that of the walk. Relative to the size of the larger power, or to 1.
+    """Largest difference between the traces of powers of two monodromy matrices: of the cycle and
+    of the walk. It is relative to the magnitude of the larger power, or to 1.
 
     Traces of powers are sums of powers of the multipliers, which need no matching.
     """
     first = turn_product(np.asarray(cycle.factors)[None])[0]
-    # (An autonomous flow keeps a deviation along itself, which is projected out of the factors.)
+    # (In an autonomous system, the multiplier 1 of the direction of the flow is projected out of
+    # the factors.)
     along = 0.0 if cycle.clocked else 1.0
     size = np.asarray(cycle.settings.scale)[int(cycle.anchor.chart[0])]
     units = size / size[:, None]
@@ -681,10 +690,11 @@ def _other_multipliers(apart: float) -> list[Finding]:
 
 
 def _unresolved_multipliers(cycle, path: _Path) -> list[Finding]:
-    """A finding on multipliers whose product is not that of the determinants of all moves.
+    """A finding if the product of the multipliers differs from the product of the determinants of
+    all moves.
 
-    Each determinant is known to nearly all digits. Multipliers are not where deviations grow by
-    many powers of ten within the period, and shrink again, as beside a separatrix.
+    Each determinant is accurate to nearly all digits. Multipliers lose digits if deviations grow by
+    many powers of ten within the period and shrink again, as near a separatrix.
     """
     if abs(path.volume) < _LEAST_PRODUCT:
         return []

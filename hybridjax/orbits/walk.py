@@ -1,9 +1,11 @@
-"""A second way along a cycle, which shares neither the method nor the steps of the first.
+"""A second integration along a cycle, which shares neither the method nor the steps of the first.
 
-The flow is computed by extrapolation: in explicit charts of the modified midpoint rule (W. B.
-Gragg, SIAM J. Numerical Analysis 2, 1965), in implicit ones of the linearly implicit Euler method
-(P. Deuflhard, SIAM Review 27, 1985). Both, with their tables of differences, are in E. Hairer and
-G. Wanner, Solving Ordinary Differential Equations, vol. I, sec. II.9, and vol. II, sec. IV.9.
+`verdict.py` calls `walk` with many *stretches* (pieces of the cycle without an event, each in one
+chart), and gets their ends, derivatives, errors and points on the way. The flow is computed by
+extrapolation: in explicit charts of the modified midpoint rule (W. B. Gragg, SIAM J. Numerical
+Analysis 2, 1965), in implicit ones of the linearly implicit Euler method (P. Deuflhard, SIAM Review
+27, 1985). Both, with their tables of differences, are in E. Hairer and G. Wanner, Solving Ordinary
+Differential Equations, vol. I, sec. II.9, and vol. II, sec. IV.9.
 """
 
 from collections.abc import Callable
@@ -18,30 +20,30 @@ from .scale import is_implicit
 
 
 # Error of a step, in sizes of the states, at which it is accepted. Larger: small faults of a cycle
-# pass. Smaller: steps are shortened although rounding is all that is left.
+# pass. Smaller: steps are shortened for errors that are only rounding.
 _ACCURATE = 1e-8
-# Largest error of a stretch that counts as known. Larger: errors of the walk are taken for faults
-# of the cycle. Smaller: fields with kinks cannot be walked.
+# Largest error of a stretch whose end counts as known. Larger: errors of this integration count as
+# faults of the cycle. Smaller: fields with kinks cannot be checked.
 ROUGH = 1e-6
-# Steps after which a stretch is given up. More: a walk that cannot succeed takes longer. Fewer:
+# Number of steps after which a stretch is given up. More: hopeless stretches take longer. Fewer:
 # fast jumps of a neuron are not resolved.
 _PATIENCE = 400
-# Numbers of shorter steps of the methods that are extrapolated. More: each step costs more. Fewer:
-# more steps are needed.
+# Numbers of substeps into which a step is divided for extrapolation. More: each step costs more.
+# Fewer: more steps are needed.
 _MIDPOINT_STEPS = (2, 4, 6)
 _EULER_STEPS = (1, 2, 3, 4, 5, 6)
-# The change of the length of a step, at most and at least, and the safety factor: those of Hairer
+# Largest and smallest change of the step length from step to step, and safety factor, as in Hairer
 # and Wanner's codes ODEX and SEULEX.
 _LONGER = 4.0
 _SHORTER = 0.2
 _SAFE = 0.8
-# Points within a step at which the path is known, as fractions of it; the last is its end. More:
-# guards cost more. Fewer: a guard that dips below zero and back is missed.
+# Points within a step at which the path is known, as fractions of the step; the last one is its
+# end. More: guards cost more. Fewer: a guard that dips below zero and back is missed.
 _FRACTIONS = np.linspace(0.0, 1.0, 9)[1:]
 
 
 class Stretch(NamedTuple):
-    """L pieces of flow without events, each in its chart."""
+    """L pieces of flow without events. Each piece lies in one chart."""
 
     t: Float[np.ndarray, " L"]
     """Times at which they begin."""
@@ -74,7 +76,7 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
     q = np.zeros((d, L))
     by_state = np.zeros((d, d, L))
     error = np.zeros(L)
-    # Parts of the path, first one without any point.
+    # Parts of the path. The first part is empty.
     lane = [np.zeros(0, int)]
     time = [np.zeros(0)]
     points = [np.zeros((d, 0))]
@@ -112,8 +114,8 @@ def walk(s: Structure, stretch: Stretch, scale: Float[np.ndarray, "A d"]) -> Wal
     )
 
 
-# In a chart with n states, x (L, n, 1 + n) holds states in its first column, in the others their
-# derivatives by the state at the beginning. So do the rates of x.
+# In a chart with n states, x (L, n, 1 + n) has the states in its first column, and in the others
+# the derivatives of the states by those at the beginning. Rates of x have the same form.
 
 
 def _in_chart(s: Structure, a: int, begin, length, q, sizes):
@@ -149,7 +151,8 @@ def _in_chart(s: Structure, a: int, begin, length, q, sizes):
             off = np.where(np.isfinite(off), off, np.inf)
             better = _ACCURATE / np.maximum(off, 1e-300)
             longer = _SAFE * better ** (1 / order)
-            # (Steps as short as rounding of the time go on with the error that they have.)
+            # (Steps that are as short as the rounding error of the time are accepted with any
+            # error.)
             longest_time = np.maximum(np.abs(t), length[going])
             shortest = h[going] <= 1e-13 * longest_time
             good = (off <= _ACCURATE) | shortest
@@ -225,8 +228,8 @@ def _linear_euler(
 def _extrapolate(
     table: list[np.ndarray], divisors: Int[np.ndarray, " K"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The limit for infinite divisors of values that are series in their inverses (Aitken and
-    Neville), and the last change of the states."""
+    """Extrapolate values for several numbers of substeps to infinitely many (Aitken and Neville).
+    Also returns the last change of the states."""
     column = table
     previous = column[-1]
     for order in range(1, len(table)):
@@ -246,8 +249,8 @@ def _extrapolate(
 def _between(
     t, length, x0, x1, by_begin, by_end
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Times and states within steps, by the polynomials of degree 5 that have the states, rates and
-    accelerations of both ends."""
+    """Times and states within steps, by polynomials of degree 5 through the states, rates and
+    accelerations at both ends."""
     n = x0.shape[1]
     h = length[:, None]
 

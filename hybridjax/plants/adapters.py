@@ -1,4 +1,10 @@
-"""Simulators of other packages as plants: MuJoCo, FMI 2.0 (co-simulation), Gymnasium."""
+"""Simulators of other packages as plants: MuJoCo, FMI 2.0 (co-simulation), Gymnasium.
+
+Each class has the methods of the protocol `Plant` (`drive.py`), which `find_cycle` and experiments
+call: `reset(seed)` begins again, and `step(u, duration)` holds the inputs u and returns the signals
+by name. If the state can be set, there are `get_state` and `set_state`, too. A simulator of another
+package becomes a plant by one more class of this kind.
+"""
 
 import dataclasses
 import functools
@@ -23,7 +29,8 @@ from ..errors import ComputationError, DefinitionError
 
 
 class _Made:
-    """A plant that another process makes again from its fields."""
+    """Base of plants that are pickled by their fields, so that another process makes the plant
+    again."""
 
     def __reduce__(self) -> Any:
         fields = {x.name: getattr(self, x.name) for x in dataclasses.fields(self)}  # type: ignore[arg-type]
@@ -92,10 +99,12 @@ class MuJoCoPlant(_Made):
         self._names = [*positions, *velocities, *readings]
         activations = [f"act{i}" for i in range(model.na)]
         self.states = ("time", *positions, *velocities, *activations)
-        # (With the memory of controllers, and where the solver of contacts begins.)
+        # (The full state: it includes the memory of controllers, and the start of the contact
+        # solver.)
         self._kept = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-        # The positions of bodies, contacts and sensors belong to the present state after `mj_step1`
-        # but not after `mj_step`. (Those of 1, Runge-Kutta, cannot be divided.)
+        # Positions of bodies, contacts and sensors belong to the present state after `mj_step1`,
+        # but not after `mj_step`. So a step is divided in two, which is not possible with
+        # integrator 1 (Runge-Kutta).
         if model.opt.integrator == 1:
             self._integrate = mujoco.mj_step
         else:
@@ -112,7 +121,8 @@ class MuJoCoPlant(_Made):
     def step(self, u: Sequence[float], duration: float) -> Mapping[str, float]:
         """Hold the inputs for some time."""
         whole_step = self.dt / self.substeps
-        # (A duration of n steps, up to rounding, is n steps, and no step is shorter than that.)
+        # (A duration of n steps up to rounding gives n steps. The small number keeps rounding from
+        # adding a very short step.)
         count = int(duration / whole_step + 1e-9)
         rest = duration - count * whole_step
         for _ in range(count):

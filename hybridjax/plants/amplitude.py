@@ -1,4 +1,10 @@
-"""Whether inputs of experiments on a plant are too large, or too small."""
+"""Test whether inputs of experiments on a plant are too large or too small.
+
+`PlantCycle.run_experiments` calls `doubts_about_inputs` with the responses to an input, to half of
+it, and to none. The response should be twice the response to half of the input. If it is not, the
+input is too large (curvature) or too small: simulators with fixed time steps let contacts begin at
+the ends of steps, so that the response is a *staircase* as a function of the input.
+"""
 
 from typing import Any
 
@@ -10,27 +16,30 @@ from .._core.text import listed
 from .returns import ReturnMap
 
 
-# Difference between the response to an input and twice that to half of it, relative to the
-# response, that is reported. Larger: it biases weak multipliers. Smaller: every contact is doubted.
+# Difference between the response to an input and twice the response to half of it, relative to the
+# response, above which there is a finding. Larger: curvature biases weak multipliers, and there is
+# no finding. Smaller: every contact gives a finding.
 _NONLINEAR = 1e-3
-# Scatter of returns over the grid of time, relative to the returns, that is a staircase. Larger:
-# stairs that bias multipliers pass. Smaller: errors of integration are called stairs.
+# The response is a staircase if returns scatter by more than this part of their size when the grid
+# of time steps is shifted. Larger: stairs that bias multipliers pass. Smaller: errors of
+# integration count as stairs.
 _STAIRS = 1e-3
-# A response differs from twice that to half of the input because of stairs or because of curvature.
-# Below this part of the scatter it differs so little that no contact moved to another time step.
-# Larger: experiments that met a few stairs are doubted. Smaller: curvature within a stair counts as
-# the next one.
+# If the response differs from twice that to half of the input by less than this part of the scatter
+# (see `_stairs`), no contact has moved to another time step: all inputs are on one stair. Larger:
+# experiments that met a few stairs give a finding. Smaller: curvature within a stair counts as
+# another stair.
 _ON_ONE_STAIR = 0.1
-# Above this multiple of the scatter, curvature is the reason. Larger: curvature passes. Smaller:
-# stairs are called curvature, for which smaller inputs are advised, and these make stairs worse.
+# If this difference is above this multiple of the scatter, its cause is curvature. Larger:
+# curvature passes. Smaller: stairs count as curvature; the advice is then a smaller input, which
+# makes stairs worse.
 _MANY_STAIRS = 3.0
 
 
 def doubts_about_inputs(
     cycle: Any, full: Float[np.ndarray, "n ny"], half: Float[np.ndarray, "n ny"]
 ) -> list[Finding]:
-    """Return findings about an input, by the responses to it and to half of it, less what the plant
-    does without input."""
+    """Return findings about an input, from the responses to the input and to half of it, both less
+    the motion without input."""
     size = np.sqrt((full**2).mean(axis=0))
     stairs = _stairs(cycle)
     difference = np.sqrt(((full - 2 * half) ** 2).mean(axis=0))
@@ -63,8 +72,8 @@ def doubts_about_inputs(
 
 
 def _stairs(cycle: Any) -> Float[np.ndarray, " ny"]:
-    """Return the scatter of the outputs over the grid of time. It is 0 where that is no staircase,
-    and for a plant whose grid cannot be moved."""
+    """Return the scatter of each output when the grid of time steps is shifted. It is 0 for an
+    output without a staircase, and for a plant whose grid cannot be shifted."""
     columns = list(cycle.drive.columns)
     if not cycle.drive.sets or cycle.drive.fixed:
         return np.zeros(len(columns))
@@ -76,7 +85,7 @@ def _stairs(cycle: Any) -> Float[np.ndarray, " ny"]:
         _, signals = returns.changes_over_grids()
     except (
         Exception
-    ):  # (a plant that falls beside its cycle: experiments count all the same)
+    ):  # (a plant that falls near its cycle: experiments are kept all the same)
         return np.zeros(len(columns))
     changes = signals[:, columns]
     scatter = changes.std(axis=0, ddof=1)

@@ -1,8 +1,11 @@
-"""The limit cycle of a plant: the sections on it, outputs there, and experiments around it.
+"""The limit cycle of a plant (a simulator of another package): sections on it, and experiments
+around it.
 
-`find_cycle` lets the plant settle, or solves for the cycle from a guess (`returns.py`), and
-`_measure` records it. Steps, sections within a step and single experiments are those of `drive.py`:
-a section at a wrong time or an input that acts too late has its cause there.
+`find_cycle` lets the plant settle, or solves for the cycle from a guess (`returns.py`). `_measure`
+then records some cycles, and returns a `PlantCycle`, whose methods run experiments. The plant
+itself is driven by `drive.py`: if a section is at a wrong time, or an input acts too late, look
+there. `_phase_of` turns a family of sections into the rule by which `drive.py` recognizes a
+section.
 """
 
 import dataclasses
@@ -41,15 +44,15 @@ from .drive import At, Drive, Plant, PlantPhase, Trial, resume, run_all
 from .returns import ReturnMap, Returns, measured_returns
 
 
-# Fewest experiments whose inputs are tested, by one experiment more. Fewer: single records, which
-# are no estimates, take twice the time.
+# From this number of experiments on, the size of the inputs is tested by further runs. Fewer:
+# single records, from which nothing is estimated, take twice the time.
 _FEWEST = 4
 Draw = Callable[[Any], Any]
 Inputs = Annotated[Numbers, Reals("n inputs")]
 
 
 class Recorded(system.HybridSystem):
-    """The signals of a plant as the states of a system that is only looked at."""
+    """The signals of a plant as states of a `HybridSystem` that is only drawn, never integrated."""
 
     states: tuple[str, ...] = eqx.field(static=True)
     picture: Callable[[Any], Any] | None = eqx.field(static=True)
@@ -73,7 +76,7 @@ class PlantCycle(Showable):
     - `plant`, `sections`, `inputs`, `outputs`.
     - `period`: mean duration of a cycle.
     - `cycle_outputs` (N, ny): mean outputs at the sections.
-    - `state`: that of the plant on section 0, if it can be set.
+    - `state`: state of the plant on section 0, if it can be set.
     """
 
     plant: Plant
@@ -136,12 +139,12 @@ class PlantCycle(Showable):
         with working("run_experiments"):
             about = ""
             if store is not None:
-                # (After experiments the plant's state would be another one at each call.)
+                # (Without the reset, the plant's state would differ from call to call.)
                 self.drive.reset(self.seed)
                 cycle = self.outputs, self.cycle_outputs, self.sections, self.seed
                 about = digest_of(self.drive.plant, *cycle, u)
             trials = resume(store, about, len(u), run)
-        # (Rows are as long as the inputs, and NaN from the end of an experiment on.)
+        # (All rows are as long as the inputs. After the end of an experiment they are NaN.)
         S, steps = u.shape[:2]
         rows = np.full((S, steps, len(self.outputs) + 1), np.nan)
         failed_at = np.full(len(u), -1)
@@ -183,9 +186,9 @@ class PlantCycle(Showable):
         failed_at: Int[np.ndarray, " S"],
         at_rest: Float[np.ndarray, "n ny"],
     ) -> list[Finding]:
-        """Return findings about the size of the inputs, of which the first experiment is repeated
-        with half of its input and without any: noise with the same seed, and what is left of a
-        transient, are in all of them."""
+        """Return findings about the size of the inputs. The first experiment is repeated with half
+        of its input, and without input. (Noise with the same seed, and the rest of a transient, are
+        the same in all three.)"""
         whole = np.flatnonzero(failed_at < 0)
         if len(whole) < _FEWEST or not responses[whole[0]].any():
             return []
@@ -339,7 +342,8 @@ def find_cycle(
             raise DefinitionError("`guess` must be a state, as `get_state` returns it.")
         drive.restore(At(0.0, drive.z, state=np.asarray(guess)))
         drive.step(drive.zero, drive.dt)
-    # (One turn shows the sense of an angle; that of a guess is seen near it.)
+    # (One revolution shows whether an angle grows or decreases; near a guess, a small part of it
+    # suffices.)
     drive.phase = _phase_of(drive, family, 1.0 if guess is None else 0.01)
     drive.phase.begin(drive.t, drive.z)
     settling = cycles if guess is None else 0
@@ -398,7 +402,8 @@ def _signals_at(points: Sequence[At]) -> Float[np.ndarray, "n signals"]:
 
 
 def _turn(drive: Drive, family: Any, points: list[At]) -> tuple[At, list[At]]:
-    """One cycle from section 0 on: where it begins, and where it meets the sections."""
+    """One cycle from section 0 on. Returns the point at which it begins, and the points on the
+    sections; steps are appended to `points`."""
     start = drive.here()
     drive.phase.begin(drive.t, drive.z, on_section=True)
     sections = range(1, family.n_sections + 1)
@@ -410,7 +415,8 @@ def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> N
     first = values[:half].mean(axis=0)
     last = values[-half:].mean(axis=0)
     change = np.abs(first - last)
-    # (In a trend this is 1.7 standard deviations, in noise of ten cycles 0.6.)
+    # (With a linear trend, `change` is 1.7 standard deviations of the values; with noise over ten
+    # cycles, about 0.6.)
     scatter = 1.6 * values.std(axis=0)
     if (change > np.maximum(1e-4 * size, scatter)).any():
         raise ComputationError(
@@ -421,8 +427,8 @@ def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> N
 def _phase_of(drive: Drive, family: Any, turns: float) -> PlantPhase:
     """Return the `PlantPhase` by which a plant is taken to the sections of a family.
 
-    **Arguments:** `turns`: the plant runs for so many turns of an angle, to learn in which sense it
-    turns.
+    **Arguments:** `turns`: the plant runs for this many revolutions of the angle, which show
+    whether the angle grows or decreases.
     """
     period = getattr(drive.plant, "period", None)
     items: Any = getattr(family, "items", ())
@@ -457,7 +463,8 @@ def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> PlantPhase:
 def _by_angle(
     drive: Drive, family: families.KinematicPhase, anchor: float, turns: float
 ) -> PlantPhase:
-    """Sections by the angle of two signals, whose sense so many turns show."""
+    """Sections by the angle of two signals. The plant runs for `turns` revolutions, which show
+    whether the angle grows or decreases."""
     pair = family.position, family.velocity
     require_among("signal", pair, drive.names, "KinematicPhase(position, velocity): ")
     columns = [drive.names.index(x) for x in pair]

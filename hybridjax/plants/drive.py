@@ -1,8 +1,13 @@
-"""A plant driven from section to section, in processes that may fail, hang or end without harm to
-the others. They import this file, so it needs only Python.
+"""A plant driven from section to section, in worker processes that may fail, hang or end without
+harm to the others.
 
-The processes are not those of `multiprocessing`: these would run the main script again, and cannot
-be ended one by one.
+`cycle.py` makes a `Drive`, which joins a `Plant` (`reset`, `step`) with a `PlantPhase` (which
+section comes when), and calls `advance` for single sections, or `resume` and `run_all` for many
+experiments in processes. Each returns points (`At`) or a `Trial`. A section at a wrong time comes
+from `PlantPhase.level`, a wrong signal on it from `_landed` or `_interpolated`.
+
+Workers import this file, so that it needs only Python. They are not those of `multiprocessing`,
+which would run the main script again, and cannot be ended one by one.
 """
 
 import contextlib
@@ -64,12 +69,13 @@ class Plant(Protocol):
 
 @dataclasses.dataclass
 class PlantPhase:
-    """Sections at equal phases of a period, of the angle of two signals, or where signals cross
-    levels.
+    """The rule by which a section is recognized: at equal phases of a period, at equal angles of
+    two signals, or where signals cross levels.
 
     **Fields:** `first`: time or angle of section 0. `axes`: column, center and scale of the two
-    signals. `sense`: -1 if the angle decreases. `start`: turns at which sections are counted.
-    `crossings`: column, sign (1 if it falls) and level of each section.
+    signals of the angle. `sense`: -1 if the angle decreases. `start`: the angle, in revolutions,
+    from which on sections are counted. `crossings`: for each section the column of its signal, the
+    sign (1 if the signal falls) and the level.
     """
 
     n: int
@@ -88,8 +94,9 @@ class PlantPhase:
         self.start = round(self.turns) if on_section else math.ceil(self.turns)
 
     def level(self, k: int, t: float, z: Sequence[float]) -> float:
-        """Return a number that falls through zero at section k, counted from `begin` on: the time
-        until then, an angle in turns, which is unwrapped, or a signal above its level."""
+        """Return a number that falls through zero at section k, counted from `begin` on. It is the
+        time until the section, the angle until the section (unwrapped, in revolutions), or the
+        signal minus its level."""
         if self.crossings:
             c, sign, value = self.crossings[k % self.n]
             return sign * (z[c] - value)
@@ -104,8 +111,9 @@ class PlantPhase:
 
 
 class At(NamedTuple):
-    """A point of a course: time and signals, at sections interpolated between two steps; the time
-    by which the plant is beyond it; and the state of a plant that can be set."""
+    """A point on the way of a plant: time and signals (on a section they may be interpolated
+    between two steps); the time by which the plant has gone beyond the point; and the state, if it
+    can be set."""
 
     t: float
     z: Sequence[float]
@@ -114,8 +122,8 @@ class At(NamedTuple):
 
 
 Trial = tuple[list[list[float]], str]
-"""One experiment: signals at the sections and lateness (n, ny + 1), and the cause of its end, "" if
-it ran to its end."""
+"""One experiment: outputs at the sections, with the lateness as a last column (n, ny + 1); and the
+reason why it ended early, "" if it did not."""
 
 
 class Drive:
@@ -123,10 +131,12 @@ class Drive:
 
     **Fields:**
 
-    - `names`: signals in order; empty: those of the first observation. `columns`: of the outputs.
-    - `phase`: the sections. `longest`: time that one section may take, at first a million steps.
-    - `start`: on section 0. `warmup`: time for which a plant whose state cannot be set runs after
-      `reset` instead.
+    - `names`: names of the signals in order. If empty, the names of the first observation are
+      taken. `columns`: columns of the outputs.
+    - `phase`: the rule of the sections. `longest`: longest time from one section to the next.
+      Default: a million steps.
+    - `start`: point on section 0 at which experiments start. `warmup`: for a plant whose state
+      cannot be set, the time for which it runs after `reset` instead.
     - `t`, `z`: present time since `reset`, and signals. `last`: the point before, if known.
     """
 
@@ -191,9 +201,12 @@ class Drive:
             self.step(self.zero, self.dt)
 
     def advance(self, u: Sequence[float], k: int, points: list[At] | None = None) -> At:
-        """Hold the input until section k, and append the points before all steps. Steps end on the
-        section if its time is known, or if the state can be set; steps of fixed length end after
-        it. A crossing counts after a step that ends before it, so that none is counted twice."""
+        """Hold the input until section k, and append the point before each step to `points`.
+
+        The last step ends on the section if the time of the section is known or if the state can be
+        set. Otherwise it ends after the section. A crossing counts only if a step has ended before
+        it, so that no crossing is counted twice.
+        """
         phase = self.phase
         began = self.t
         armed = not phase.crossings
@@ -221,7 +234,8 @@ class Drive:
         return self._interpolated(last, before, level)
 
     def _point(self, points: list[At] | None, with_state: bool) -> At:
-        """The present point, which is appended to `points`, if there are any, with its state."""
+        """Return the present point, with its state if `with_state`. It is also appended to
+        `points`, unless these are None."""
         if points is None and not with_state:
             return At(self.t, self.z)
         point = self.here()
@@ -245,7 +259,8 @@ class Drive:
         return At(self.t, self.z)
 
     def _interpolated(self, last: At, before: float, level: float) -> At:
-        """Where the line between the last two points meets the section, by their levels."""
+        """Return the point at which the line between the last two points meets the section.
+        `before`, `level`: levels at these two points."""
         share = before / (before - level) if before > level else 1.0
         at = last.t + share * (self.t - last.t)
         ends = zip(last.z, self.z, strict=True)
@@ -292,8 +307,9 @@ class Drive:
 
 
 def serve() -> None:
-    """Run experiments in a worker: standard input holds pickles that only the parent writes (the
-    packed `Drive`, then the seed and inputs of each), standard output the answers."""
+    """Run experiments in a worker process. The parent writes pickles to its standard input (the
+    packed `Drive`, then seed and inputs of each experiment) and reads results from its standard
+    output."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a plant prints goes to standard error
     try:
@@ -362,7 +378,8 @@ def resume(
     count: int,
     run: Callable[[list[int]], Any],
 ) -> list[Trial]:
-    """Run the experiments that a file of SQLite (None: memory) lacks, and keep each as it ends.
+    """Run the experiments that are not yet in a file of SQLite (None: memory), and store each one
+    when it ends.
 
     **Raises:** `DefinitionError` for a file of another kind, or in a folder that is not there.
     """
@@ -403,7 +420,8 @@ def _start(packed: bytes, begun: list[Any]) -> Any:
 
 
 def _pack(drive: Drive) -> bytes:
-    """Return a pickle; of classes in notebooks and scripts by cloudpickle, where it is installed.
+    """Return the pickle of a drive. Classes in notebooks and scripts are pickled by cloudpickle, if
+    it is installed.
 
     **Raises:** `DefinitionError` for a plant that cannot be pickled.
     """

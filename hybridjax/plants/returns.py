@@ -1,10 +1,14 @@
-"""Multipliers of a plant from returns of perturbed states to section 0.
+"""Multipliers of a plant (a simulator of another package) from returns of perturbed states to
+section 0.
 
+The *return* of a state is the state after one cycle, when the plant meets section 0 again.
 Simulators with fixed time steps let contacts begin and end at the ends of steps. The return is then
-a staircase as a function of the state: within a stair it has no noise, and a wrong slope.
+a *staircase* as a function of the state: within one stair it has no noise, and a wrong slope.
+Therefore the beginning of the time steps (the *grid*) is shifted from pair to pair of perturbed
+states.
 
-Its caller (`cycle.py`) has called `ReturnMap.measure`, which finds the noise of returns, and the
-sizes of steps from it. `measured_returns` then takes the stages in order:
+`cycle.py` first calls `ReturnMap.measure`, which finds the noise of returns and chooses step sizes.
+It then calls `measured_returns`, which takes four stages:
 
 1. `ReturnMap.solve` moves the state to the fixed point of the return.
 2. `ReturnMap.all_slopes` measures central differences with several steps.
@@ -12,9 +16,9 @@ sizes of steps from it. `measured_returns` then takes the stages in order:
 4. `_eigenvalues` and `_resolved` find the multipliers that differ from 0, with their covariance.
 
 Stages 2 to 4 are repeated with the longest steps if noise may hide a multiplier, and with shorter
-ones if narrow and wide steps disagree. The constants may be changed: each says what gets worse in
-either direction. For a wrong multiplier, compare `ReturnMap.slopes` with a Jacobian that is known,
-then each stage with the one before.
+steps if narrow and wide steps disagree. For a wrong multiplier, compare `ReturnMap.slopes` with a
+known Jacobian, then each stage with the one before. The constants may be changed: comments say what
+gets worse in either direction.
 """
 
 from typing import Any, NamedTuple
@@ -31,59 +35,65 @@ from .._core.text import listed
 from ..errors import ComputationError, DefinitionError
 from ..identify.denominator import coefficients_of
 from ..identify.multiplier_estimate import MultiplierFit
+from ..linear.multipliers import largest_first
 from ..sections import families
 from .drive import At
 
 
-# Steps of the pairs of perturbed states of one coordinate, in units of the smallest. Fewer: noise
-# cannot be told from curvature. More: time. A ratio of 2 between the largest and the smallest:
-# narrow and wide steps hardly differ; of 8: the widest ones leave the linear range. Equal ones: no
-# scatter, where the grid of time is not moved.
+# Steps of the pairs of perturbed states, in units of the smallest one. Fewer: noise cannot be told
+# from curvature. More: time. If the largest is only twice the smallest, narrow and wide steps
+# hardly differ; if it is eight times the smallest, it leaves the linear range. Equal steps have no
+# scatter if the grid is not shifted.
 _STEPS = np.array([1.0, 1.2, 2.0, 2.4, 3.3, 4.0])
 # The first four are narrow, the last four wide.
 _NARROW = _STEPS <= _STEPS[3]
 _WIDE = _STEPS >= _STEPS[2]
-# Even powers of the step, with the constant, about which the scatter of slopes is the noise: with
-# fewer, curvature counts as noise; with more, few degrees of freedom remain.
+# The noise of slopes is their scatter about a polynomial with this many even powers of the step,
+# the constant included. Fewer: curvature counts as noise. More: few degrees of freedom remain.
 _POWERS_OF_SCATTER = 3
 # All steps are repeated until coordinates times repetitions reach this number. Smaller: the noise
 # of one coordinate is known from six pairs only. Larger: more time for few coordinates.
 _COLUMNS = 4
-# The smallest of the steps is at most this part of the range of a coordinate. Larger: the widest
-# steps, four times as long, leave the linear range. Smaller: contacts of simulators with fixed time
-# steps begin at the same step for all of them, so that their noise hides.
+# Upper limit of the smallest step, as a part of the range of a coordinate. Larger: the widest
+# steps, four times as long, leave the linear range. Smaller: contacts begin at the same time step
+# for all perturbed states, so that the staircase is not seen.
 _MOST_OF_SMALLEST_STEP = 0.01
-# Phases of the grid at which its noise is measured. Fewer: stairs between them hide. More: time.
+# Number of shifts of the grid at which its noise is measured. Fewer: stairs between two shifts are
+# missed. More: time.
 _GRIDS = 8
-# Phases of the grid with which the plant is tried. With a single one, a plant whose steps divide
-# this phase would not show its grid.
+# Shifts of the grid (in steps) with which it is tested whether the plant can be shifted. With a
+# single one, a plant whose own steps divide this shift would not show its grid.
 _TRIED = (0.381966, 0.618034)
-# Part of the range by which a return may differ if the grid is moved. Larger: controllers that
-# count time steps are disturbed. Smaller: errors of integration count as a disturbance.
+# The grid is shifted only if returns then change by less than this part of the range. Larger:
+# controllers that count time steps are disturbed. Smaller: errors of integration count as a
+# disturbance.
 _GRID_ERROR = 0.03
-# Bias of J in units of the difference between narrow and wide steps: 1.8 for a jump of the second
-# derivative, 0.8 for a fifth derivative. Smaller: regions miss such a jump.
+# Assumed bias of the Jacobian, in units of the difference between narrow and wide steps. (It is 1.8
+# for a jump of the second derivative, and 0.8 for a fifth derivative.) Smaller: regions are too
+# small near such a jump.
 _BIAS = 1.8
-# Standard errors by which a multiplier differs from 0, and narrow from wide steps. Smaller: noise
-# is listed. Larger: multipliers hide.
+# A multiplier differs from 0, and narrow steps differ from wide steps, if the difference exceeds
+# this many standard errors. Smaller: noise is listed as a multiplier. Larger: multipliers are not
+# listed.
 _RESOLVED = 3.0
-# Difference between narrow and wide steps, in units of the multiplier, that is reported. Smaller:
-# harmless curvature, which the errors contain, is reported.
+# Relative difference of a multiplier between narrow and wide steps above which there is a finding.
+# Smaller: harmless curvature, which the errors contain, gives a finding.
 _APART = 0.1
-# The same in units of the largest multiplier, with which shorter steps are tried. Smaller: twice
-# the time for a few digits. Larger: wide regions.
+# Difference of a multiplier between narrow and wide steps, relative to the largest multiplier,
+# above which shorter steps are tried. Smaller: twice the time for a few digits. Larger: wide
+# regions.
 _CURVED = 0.01
-# Rounding of an eigenvalue of condition 1, in units of the norm of the Jacobian. Smaller: rounding
-# is listed as multipliers. Larger: small multipliers of smooth plants hide.
+# Rounding error of a well-conditioned eigenvalue, in units of the norm of the Jacobian. Smaller:
+# rounding is listed as multipliers. Larger: small multipliers of smooth plants hide.
 _ROUNDING = 1e-13
-# Residual of a state on the cycle, in units of the range, below which it is no doubt. Smaller:
-# tolerances of integrators are doubted. Larger: multipliers of another orbit.
+# A state is on the cycle if its residual, in units of the range, is below this. Smaller: tolerances
+# of integrators give a finding. Larger: multipliers of another orbit.
 _RESIDUAL = 1e-5
-# Modulus of multipliers that are no doubt if they hide. Smaller: plants that forget everything in
-# one cycle are doubted. Larger: what matters hides.
+# Multipliers below this modulus may hide without a finding. Smaller: plants that forget everything
+# in one cycle give a finding. Larger: important multipliers hide.
 _SMALL = 0.05
-# Range of a coordinate below which it is rounding, in units of the largest number of the state.
-# Larger: motions in small units are taken as rest. Smaller: differences of rounding errors count as
+# A range of a coordinate below this part of the largest number of the state is a rounding error.
+# Larger: motions in small units count as rest. Smaller: differences of rounding errors count as
 # slopes.
 _REST = 1e-13
 _DRAWS = 1000
@@ -95,8 +105,8 @@ class Returns(MultiplierFit):
     **Fields** beside those of all fits of multipliers:
 
     - `coordinates`: names of the numbers that were perturbed.
-    - `travelling`: names of those that grow in each cycle and on which nothing depends, such as the
-      distance walked. Their multipliers are 1 and are not listed.
+    - `travelling`: names of coordinates that grow in each cycle and on which nothing depends, such
+      as the distance walked. Their multipliers are 1 and are not listed.
     - `noise` (d,): standard deviation of each coordinate in returns from nearly equal states.
     - `residual`: largest distance between state and return, in units of the range of the
       coordinate on the cycle.
@@ -129,11 +139,12 @@ class Returns(MultiplierFit):
 class ReturnMap:
     """The return map of some coordinates of a plant on section 0, and its fixed point.
 
-    **Fields:** `names`: of the coordinates. `x`: their values, first those of the settled state.
-    `travelling`: names of coordinates on which nothing depends. `size`: ranges on the cycle.
-    `noise`: of returns; `tolerance`: of those of states that are nearly equal, which is rounding
-    and the tolerances of the plant. `h`: the smallest steps of differences. The last five are known
-    after `measure`. `signals`: of the plant, after the last return.
+    **Fields:** `names`: names of the coordinates. `x`: values of the coordinates, at first those of
+    the settled state. `signals`: signals of the plant after the last return. Five fields are known
+    after `measure`: `travelling`, names of coordinates that grow in each cycle and on which nothing
+    depends; `size`, ranges of the coordinates on the cycle; `noise`, standard deviation of returns;
+    `tolerance`, standard deviation of returns from nearly equal states, caused by rounding and by
+    the tolerances of the plant; `h`, the smallest steps of differences.
     """
 
     def __init__(self, cycle: Any, names: SignalNames | None = None):
@@ -163,7 +174,8 @@ class ReturnMap:
         self.signals = np.array(cycle.drive.start.z, float)
         self.n = cycle.sections.n_sections
         self.moves_grid = False
-        # (A perturbed state before a crossing must not return to it at once.)
+        # (If the perturbation puts a state before its crossing, this crossing must not count as the
+        # return.)
         self.free = cycle.period / 2 if self.drive.phase.crossings else 0.0
 
     def __call__(
@@ -200,8 +212,8 @@ class ReturnMap:
             changes, _ = self.changes_over_grids()
             noise = np.std(changes, axis=0, ddof=1) / np.sqrt(2)
             self.noise = np.maximum(self.noise, noise)
-        # Steps at which noise and the error of fourth order are nearly equal for a function of unit
-        # derivatives.
+        # Steps at which noise and the error of fourth order are nearly equal, for a function with
+        # derivatives of magnitude 1.
         step = (self.noise / self.size).max() ** 0.2 / 2
         self.h = self.size * min(step, _MOST_OF_SMALLEST_STEP)
 
@@ -214,14 +226,14 @@ class ReturnMap:
         size = np.ptp(rows, axis=0)
         largest = np.abs(rows).max(axis=0)
         rounding = _REST * largest.max(initial=0)
-        # (A coordinate that does not move has the size of its value, one at zero the size 1.)
+        # (If a coordinate does not move, its size is its value, or 1 if it is zero.)
         rest = np.where(largest > rounding, largest, 1.0)
         moves = size > np.maximum(1e-9 * largest, rounding)
         self.size = np.where(moves, size, rest)
 
     def grid_may_move(self) -> bool:
-        """Return whether the plant may begin with a shorter time step. (A controller that counts
-        time steps is disturbed by it.)"""
+        """Return whether the grid may be shifted, by a shorter first time step. (This disturbs a
+        controller that counts time steps.)"""
         plain = self(self.x)
         moved = [self(self.x, first=part) for part in _TRIED]
         change = np.abs(np.array(moved) - plain)
@@ -230,10 +242,11 @@ class ReturnMap:
     def changes_over_grids(
         self,
     ) -> tuple[Float[np.ndarray, "grids d"], Float[np.ndarray, "grids signals"]]:
-        """Return differences between the returns of two states, and between the signals there, for
-        several phases of the grid of time.
+        """Return differences between the returns of two states, and between the signals after them,
+        for several shifts of the grid.
 
-        Within a stair of a simulator, returns from nearly equal states have no noise: these have.
+        Within one stair of a simulator, returns from nearly equal states have no noise. With shifts
+        of the grid, they do.
         """
         rng = np.random.default_rng(1)
         signs = rng.choice([-1, 1], len(self.x))
@@ -251,8 +264,8 @@ class ReturnMap:
     def _find_travelling(self) -> None:
         """Find coordinates that grow in each cycle, as the distance walked does.
 
-        If nothing depends on one, it is left out, unless the user chose it. Angles that make whole
-        turns stay, and their returns are counted from the turn before.
+        If nothing depends on such a coordinate, it is left out, unless the user chose it. An angle
+        that makes whole revolutions is kept, and its return is counted less one revolution.
         """
         first = self(self.x)
         second = self(first)
@@ -273,7 +286,7 @@ class ReturnMap:
             try:
                 moved_return = self(self.x + move)
                 change = np.abs(moved_return - first - move)
-            except ComputationError:  # (where the plant falls, something depends on it)
+            except ComputationError:  # (the plant falls: something depends on it)
                 continue
             travels[k] = bool((change <= tolerance).all())
         turns = steady & (np.abs(advance) > self.size / 2)
@@ -291,7 +304,7 @@ class ReturnMap:
             self._keep(np.flatnonzero(~travels))
 
     def _keep(self, rows: np.ndarray) -> None:
-        """Leave out all other coordinates."""
+        """Keep only the coordinates `rows`."""
         self.names = tuple(self.names[k] for k in rows)
         self.columns = [self.columns[k] for k in rows]
         self.shift = self.shift[rows]
@@ -301,12 +314,13 @@ class ReturnMap:
         self.tolerance = self.tolerance[rows]
 
     def _noise(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-        """Return standard deviations of returns from nearly equal states: those of the narrowest
-        spacing, and the largest.
+        """Return two standard deviations of returns from nearly equal states: at the narrowest
+        spacing of states, and the largest at any spacing.
 
-        Fourth differences along lines: their variance is 70 times that of the noise (Moré and Wild
-        2011, Estimating computational noise). Narrow spacing shows rounding and tolerances, wide
-        spacing the events that move through the time steps of a simulator.
+        They come from fourth differences along lines, whose variance is 70 times that of the noise
+        (Moré and Wild 2011, Estimating computational noise). A narrow spacing shows rounding and
+        tolerances; a wide one also shows events that move from one time step of the simulator to
+        another.
         """
         magnitude = np.maximum(np.abs(self.x), self.size)
         rounding = np.finfo(float).eps * magnitude
@@ -322,7 +336,8 @@ class ReturnMap:
             level = np.sqrt(variance)
             levels.append(np.maximum(level, rounding))
         narrowest = levels[0]
-        return narrowest, np.max(levels, axis=0)
+        largest = np.max(levels, axis=0)
+        return narrowest, largest
 
     def slopes(self) -> Float[np.ndarray, "d d"]:
         """Return central differences of second order with the smallest steps."""
@@ -334,8 +349,8 @@ class ReturnMap:
     def all_slopes(self) -> Float[np.ndarray, "pairs d d"]:
         """Return central differences with all steps, in units of the ranges of the coordinates.
 
-        The time grid of the simulator begins at another phase in each pair. Where contacts begin
-        at the ends of time steps, the differences then scatter as over many steps of the grid.
+        The grid is shifted from pair to pair. If contacts begin at the ends of time steps, the
+        differences then scatter as they would over many stairs.
         """
         d = len(self.x)
         steps = np.tile(_STEPS, max(1, _COLUMNS // d))
@@ -362,7 +377,7 @@ class ReturnMap:
 
     def solve(self) -> Float[np.ndarray, " d"]:
         """Move x to the fixed point by Newton's method, as long as the residual falls, and return
-        the residual. A state whose residual is noise stays as it is."""
+        the residual. If the residual is only noise, x does not change."""
         residual = self.residual()
         for _ in range(8):
             allowed = 3 * self.noise / self.size
@@ -370,7 +385,7 @@ class ReturnMap:
                 break
             J = self.slopes() - np.eye(len(self.x))
             J = J * self.size / self.size[:, None]
-            # (A multiplier of 1 leaves its direction as it is.)
+            # (No step is taken along the direction of a multiplier of 1.)
             step = np.linalg.lstsq(J, residual, rcond=1e-6)[0]
             before = self.x
             self.x = before - self.size * step
@@ -398,17 +413,17 @@ class ReturnMap:
 
 
 def _grid_phases(rng: np.random.Generator, count: int) -> Float[np.ndarray, " count"]:
-    """Return phases of the grid of time: one in each of so many equal parts of a step, in random
+    """Return shifts of the grid: one in each of `count` equal parts of a time step, in random
     order.
 
-    A plant may divide its steps. Phases in a regular order could then be nearly equal, or follow
-    the sizes of the steps, and their scatter would be far too small.
+    A plant may divide its time steps. Shifts in a regular order could then be nearly equal, or be
+    related to the sizes of the steps, and the scatter would be far too small.
     """
     return (rng.permutation(count) + rng.uniform(size=count)) / count
 
 
 def measured_returns(map: ReturnMap) -> Returns:
-    """Return the multipliers of a map that is measured.
+    """Return the multipliers of a map after `ReturnMap.measure`.
 
     **Raises:** `ComputationError` for a state that is not on a cycle.
     """
@@ -422,7 +437,8 @@ def measured_returns(map: ReturnMap) -> Returns:
     if _is_curved(resolved):
         map.h = map.h / _STEPS.max()
         closer = _resolved(_slopes_of(map))
-        # (Noise may hide with short steps what wide ones showed.)
+        # (Shorter steps have more noise: they are taken only if no listed multiplier is hidden by
+        # it.)
         if closer.bound < np.abs(resolved.multipliers).max():
             resolved = closer
         else:
@@ -465,15 +481,17 @@ class _Jacobian(NamedTuple):
 
     value: Float[np.ndarray, "d d"]
     errors: Float[np.ndarray, "pairs d d"]
-    """Errors of `value`, by pair. If each is multiplied by a random number of variance 1 for each
-    column, their sum has the covariance of the noise. (Outputs have errors in common: those of a
-    contact that begins one time step later.)"""
+    """Errors of `value`, by pair of perturbed states. If each column of each error is multiplied by
+    a random number of variance 1, the sum over pairs has the covariance of the noise. (This keeps
+    the correlation between outputs: a contact that begins one time step later changes all of
+    them.)"""
     tolerance: Float[np.ndarray, "d d"]
-    """Standard deviations of errors that pairs may have in common, as those of tolerances."""
+    """Standard deviations of errors that all pairs may have in common, such as those by
+    tolerances."""
     apart: Float[np.ndarray, "d d"]
-    """Jacobian by narrow steps less that by wide ones."""
+    """Jacobian by narrow steps, less the Jacobian by wide steps."""
     apart_noise: float
-    """Standard deviation of the noise of `apart` in units of that of `value`."""
+    """Standard deviation of the noise of `apart`, in units of the noise of `value`."""
 
 
 def _powers(steps: np.ndarray, count: int) -> np.ndarray:
@@ -491,15 +509,16 @@ def _solution(steps: np.ndarray, count: int) -> np.ndarray:
 def _fitted(
     slopes: Float[np.ndarray, "pairs d d"], tolerance: Float[np.ndarray, "d d"]
 ) -> _Jacobian:
-    """Fit slopes, which the tolerances of the plant change by `tolerance`, by J + c step^2. Their
-    scatter is that about a fit with a further power, which does not count curvature as noise."""
+    """Fit slopes by J + c step^2. The noise is the scatter about a fit with one more power, so that
+    curvature does not count as noise. `tolerance`: errors of the slopes by the tolerances of the
+    plant."""
     repeats = len(slopes) // len(_STEPS)
     steps = np.tile(_STEPS, repeats)
     weights = steps**2
     coefficients = np.tensordot(_solution(steps, _POWERS_OF_SCATTER), slopes, (1, 0))
     fitted = np.tensordot(_powers(steps, _POWERS_OF_SCATTER), coefficients, (1, 0))
     residuals = slopes - fitted
-    # (Of unit weight.)
+    # (In units in which all have the same variance.)
     residuals = residuals * np.sqrt(weights)[:, None, None]
     # (The Jacobian is the constant J of a fit by J + c step^2.)
     constant = _solution(steps, 2)[0]
@@ -525,13 +544,13 @@ class _Resolved(NamedTuple):
 
     multipliers: Complex[np.ndarray, " k"]
     coefficients: Float[np.ndarray, " k"]
-    """Of their polynomial."""
+    """Coefficients of the polynomial with these multipliers as roots."""
     covariance: Float[np.ndarray, "k k"]
     dof: float
     bound: float
     """Largest modulus that the other multipliers may have."""
     apart: Complex[np.ndarray, " k"]
-    """Each by narrow steps less that by wide ones; 0 where the difference may be noise."""
+    """Difference of each between narrow and wide steps; 0 if the difference may be noise."""
 
 
 class _Eigenvalues(NamedTuple):
@@ -544,12 +563,12 @@ class _Eigenvalues(NamedTuple):
 
     value: Complex[np.ndarray, " d"]
     left: Complex[np.ndarray, "d d"]
-    """Left eigenvectors in columns, each with product 1 with the right one."""
+    """Left eigenvectors in columns. The product of each with its right eigenvector is 1."""
     right: Complex[np.ndarray, "d d"]
     variance: Float[np.ndarray, "d d"]
-    """Variance of each eigenvalue by the noise of each column."""
+    """Variance of each eigenvalue (rows) that the noise of each column of the Jacobian causes."""
     apart: Complex[np.ndarray, " d"]
-    """Each by narrow steps less that by wide ones; 0 where the difference may be noise."""
+    """Difference of each between narrow and wide steps; 0 if the difference may be noise."""
     error: Float[np.ndarray, " d"]
     """Standard errors, with rounding and the bias of curvature."""
 
@@ -565,7 +584,7 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
     with np.errstate(all="ignore"):
         left = left / product.conj()
     rows = left.conj().T
-    # (Of pair j and eigenvalue i, the share of column k.)
+    # (For each pair: the part of the error of eigenvalue i that comes from column k.)
     by_column = [(rows @ error) * right.T for error in jacobian.errors]
     noise = np.stack(by_column)
     variance = (np.abs(noise) ** 2).sum(axis=0)
@@ -610,7 +629,7 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
     v = found.right[:, rows]
     w = found.left[:, rows].conj().T
     if k:
-        # (Eigenvectors of eigenvalues that nearly coincide.)
+        # (The product is the identity, unless eigenvalues nearly coincide.)
         w = np.linalg.solve(w @ v, w)
     apart = found.apart[rows]
     random = rng.standard_normal((_DRAWS, 1, 1))
@@ -632,23 +651,22 @@ def _resolved(jacobian: _Jacobian) -> _Resolved:
 
 
 def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
-    """Return the places of eigenvalues that differ from 0, the largest first: both of a pair, or
-    none."""
+    """Return the indices of eigenvalues that differ from 0, the largest first. Of a conjugate pair,
+    both or none are listed."""
     differs = np.abs(found.value) > _RESOLVED * found.error
     for i in np.flatnonzero(differs):
         distance = np.abs(found.value - found.value[i].conj())
         twin = int(np.argmin(distance))
         differs[i] = differs[i] and differs[twin]
     rows = np.flatnonzero(differs)
-    chosen = found.value[rows]
-    order = np.lexsort((-chosen.imag, -np.abs(chosen)))
-    return rows[order]
+    return rows[largest_first(found.value[rows])]
 
 
 def _bound(
     drawn: Float[np.ndarray, "draws d d"], projection: Complex[np.ndarray, "d d"]
 ) -> float:
-    """Return the modulus below which 97.5 % of draws have their eigenvalues across a projection."""
+    """Return a bound of the eigenvalues that are not listed: 97.5 % of draws have all their
+    eigenvalues below it, after projection on the rest of the space."""
     rest = np.eye(len(projection)) - projection.real
     others = np.linalg.eigvals(rest @ drawn @ rest)
     largest = np.abs(others).max(axis=1, initial=0)
@@ -660,7 +678,8 @@ def _degrees(
 ) -> float:
     """Return the smallest number of degrees of freedom of the errors (Satterthwaite 1946).
 
-    **Arguments:** `variance`: noise of each multiplier by column, each with `own` degrees.
+    **Arguments:** `variance`: variance of each multiplier by the noise of each column. `own`:
+    degrees of freedom of the noise of one column.
     """
     degrees = [np.inf]
     for parts, total in zip(variance, error**2, strict=True):

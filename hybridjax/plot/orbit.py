@@ -26,8 +26,9 @@ CHARTS = [
 """Colors of the charts of a system."""
 # Half of a section's bar, and the distance from its end to its number, in widths of the picture.
 _BAR = 0.035
-# What a corner of a name outside of the axes, or another name that it covers, counts, in points of
-# the orbit that it covers. Smaller: names lie on ticks where the orbit is dense.
+# A name is placed where it covers the fewest points of the orbit. A corner outside of the axes, or
+# another name that is covered, counts as much as this many points. Smaller: names lie on ticks
+# where the orbit is dense.
 _OUTSIDE = 10_000
 # Free pixels around a name. More: no place is free in a small picture. Fewer: names touch.
 _APART = 4

@@ -16,6 +16,7 @@ from ..identify.multiplier_estimate import (
 )
 from ..identify.rational import RationalFit
 from ..linear.ldtp import LDTP
+from ..linear.multipliers import largest_first
 from ..orbits.cycle import LimitCycle
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, legend, letters, panels
 
@@ -244,9 +245,8 @@ def _zoom(
 ) -> list[Axes]:
     """An inset around the leading true multiplier, at a place that is free of markers; none where
     it would enlarge less than twice or no place is free."""
-    by_modulus = -np.abs(true)
-    order = np.lexsort((-np.imag(true), by_modulus))
-    leading = complex(true[order[0]])
+    largest = largest_first(true)[0]
+    leading = complex(true[largest])
     reaches = [1e-12]
     for z in series.values():
         reaches.append(np.abs(z - leading).min())

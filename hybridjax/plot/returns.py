@@ -22,8 +22,8 @@ from .look import COLORS, AxesLike, Plot, legend_above, panels
 # States from which the map is drawn. Fewer: corners show in a curved map. More: time, a period of
 # simulation for each.
 _STATES = 41
-# The map is drawn this far to both sides of the cycle, in the coordinate's largest value on it.
-# Smaller: every map is its tangent. Larger: states from which there is no return.
+# The map is drawn this far to both sides of the cycle, as a part of the coordinate's largest value
+# on the cycle. Smaller: every map looks like its tangent. Larger: some states do not return.
 _REACH = 0.2
 # Largest imaginary part of a multiplier that counts as real, relative to its modulus. Smaller:
 # rounding makes double multipliers complex. Larger: deviations that turn slowly are drawn as if

@@ -1,4 +1,9 @@
-"""Data at the sections of a recorded cycle."""
+"""`SectionData`: inputs and outputs of a recording at the sections of its cycle, as deviations from
+the average cycle.
+
+`sample_sections` (`sampling.py`) makes it, and all estimates from recordings take it. Its `records`
+have the form that fits to time series use.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,16 +20,17 @@ from .._core.boundary.kinds import PeriodCount
 from .._core.html import COLORS, Curve, card, picture, text
 from .._core.showable import Showable
 from .._core.signal import unit_of, with_unit
-from .._core.text import folded, how_many
+from .._core.text import folded, how_many, number
 from ..experiments.data import ExperimentData
 from ..experiments.record import SectionSeries, uninterrupted_records
 
 
-# Fraction of the largest power of an input below which it identifies nothing. Larger: bands end
-# where transfer functions are still identified. Smaller: rounding counts as power.
+# An input has power at a frequency if its power there exceeds this part of its largest power.
+# Larger: bands end where transfer functions could still be identified. Smaller: rounding errors
+# count as power.
 LEAST_POWER = 0.01
-# Fraction of the Nyquist frequency up to which an input must have power to count as broadband.
-# Larger: every band has an edge. Smaller: responses contain frequencies that were not excited.
+# An input is broadband if it has power up to this part of the Nyquist frequency. Larger: every band
+# has an edge. Smaller: responses contain frequencies that were not excited.
 WHOLE_BAND = 0.9
 
 
@@ -35,8 +41,8 @@ class SectionData(Showable, eqx.Module):
 
     - `records`: `SectionSeries` for `fit_series`, `validate`, ...: one for each uninterrupted
       stretch. Samples in gaps are NaN, so that no equation reaches across one.
-    - `times`: for each record, the times at its sections. `trials`: for each, the index of its
-      trial.
+    - `times`: for each record, the times at its sections. `trials`: for each record, the index of
+      its trial.
     - `cycle_inputs` (N, nu), `cycle_outputs` (N, ny): the average cycle.
     - `period`: the median. `bandwidth`: bandwidth of the splines through the outputs, in Hz.
     - `spikes`: for each signal (inputs, then outputs), the number of samples left out as spikes.
@@ -179,7 +185,7 @@ class SectionData(Showable, eqx.Module):
         for name, unit, x in zip(
             self.signals, self.units, np.concatenate(self.rms()), strict=True
         ):
-            sizes.append(f"{name} {x:.3g} {unit}".rstrip())
+            sizes.append(f"{name} {number(x, 3, unit)}")
         summary = (
             f"SectionData({self.cycles:.5g} cycles of "
             f"{how_many(self.n_sections, 'section', 'sections')} in "

@@ -1,4 +1,9 @@
-"""What hardware played, by the table of its design, as signals of a recording."""
+"""`attach_design`: add the inputs that hardware played to a recording in which they were not
+measured.
+
+They are read from the CSV table of the design (`Design.write`), and placed by the phase of the
+recording.
+"""
 
 from pathlib import Path
 

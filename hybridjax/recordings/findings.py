@@ -1,4 +1,5 @@
-"""Findings about recordings.
+"""Parts that all findings about recordings share: the result of an inspection (`Inspection`), and
+phrases for the places of samples.
 
 Findings about signals are made in `inspection/`, those about estimates in `fit_warnings.py`.
 """
@@ -14,8 +15,8 @@ from .._core.showable import Showable
 from .recording import Recording, Trial
 
 
-# Standard deviations that count as certain. Larger: odd trials and weak responses pass. Smaller:
-# chance is reported.
+# A deviation of this many standard deviations counts as certain. Larger: odd trials and weak
+# responses pass. Smaller: chance is reported.
 CLEAR = 4.0
 
 NAME_REFERENCE = (

@@ -1,6 +1,9 @@
-"""Reasons to doubt what is estimated from recordings, and how many strides a better fit needs.
+"""Findings about estimates from recordings, and the number of strides that a better fit needs.
 
-Warnings about the signals themselves are made in `inspection/`.
+`identify_recording` calls `diagnosis_of`; `natural_multipliers` and `phase_response` call
+`about_natural_multipliers` and `about_phase_response`. Each function below yields the findings of
+one kind, and the constants are their limits. Findings about the signals themselves are made in
+`inspection/`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,27 +30,29 @@ from .data import LEAST_POWER, WHOLE_BAND, SectionData, input_band, input_spectr
 from .findings import NAME_REFERENCE
 
 
-# Fraction of samples: if fewer remain beyond the number of unknowns, strides are few; if more are
-# missing, they are reported. Larger: long recordings are called short. Smaller: fits with next to
-# no freedom pass, and every gap is reported.
+# There is a finding if fewer than this part of the samples remains after subtracting the number of
+# unknowns, or if more than this part is missing. Larger: long recordings are called short. Smaller:
+# fits with next to no freedom pass, and every gap is reported.
 _FEW = 0.25
 # Correlation of two outputs at a section that makes them redundant. Larger: nearly equal ones
 # pass. Smaller: outputs that share most of a response are reported.
 _SAME_OUTPUTS = 0.98
-# Least modulus of a multiplier that may be that of a tone, and what is left of its mode at the end
-# of a record. Larger: hum passes. Smaller: slow modes are called hum.
+# A multiplier may come from a tone (hum) if its modulus exceeds this, and if more than a part of
+# its mode is left at the end of a record. Larger: hum passes. Smaller: slow modes are called hum.
 _DAMPED = 0.9
 _DECAYED = 0.1
-# Cycles per record below which there are few. Larger: every result comes with the warning.
-# Smaller: a user trusts biased multipliers.
+# A record with fewer cycles than this is short. Larger: every result has this finding. Smaller:
+# results with biased multipliers do not have it.
 _FEW_CYCLES = 50
-# Limits of warnings: correlation of neighboring residuals, and level of the test for a flat curve.
-# Larger (the level: smaller): a user trusts what the data do not support. Smaller: every curve
-# comes with warnings.
+# Limits of findings about phase response curves: correlation of neighboring residuals, and level of
+# the test for a flat curve. With a larger correlation or a smaller level, curves that the data do
+# not support have no finding. With a smaller correlation or a larger level, every curve has
+# findings.
 _MEMORY = 0.2
 _LEVEL = 0.01
-# Part of an input's variance that lies within intervals, below which a wide band comes from a slow
-# input. Larger: other causes of wide bands get this name. Smaller: slow inputs are not named.
+# A wide band is explained by a slow input if less than this part of the input's variance lies
+# within intervals. Larger: other causes of wide bands get this name. Smaller: slow inputs are not
+# named.
 _FAST = 0.2
 
 
@@ -63,7 +68,7 @@ class Diagnosis(Showable, eqx.Module):
     - `plain` (d,): the multipliers from plain regression (ARX).
     - `bandwidths`: for each input the frequency (cycles per period) up to which it had power.
     - `cycles`: numbers of cycles. `expected` (k, d): the standard errors of the multipliers that
-      so many cycles like these would give.
+      these numbers of cycles would give.
     """
 
     findings: tuple[Finding, ...] = eqx.field()
@@ -77,7 +82,7 @@ class Diagnosis(Showable, eqx.Module):
         return findings or "No reason to doubt the multipliers was found."
 
     def with_earlier(self, findings: Sequence[Finding]) -> "Diagnosis":
-        """Return the advice with other findings before its own."""
+        """Return the diagnosis with other findings before its own."""
         return replace(self, findings=(*findings, *self.findings))
 
 
@@ -130,7 +135,7 @@ def diagnosis_of(
     fit: SeriesFit,
     validation: Validation | None,
 ) -> Diagnosis:
-    """Return advice about the fit alone, from data that were prepared for it."""
+    """Return a diagnosis of the fit alone, from data that were prepared for it."""
     N, R, _, nu = fit.numerators.shape
     d = len(fit.multipliers)
     extra_lags = R - 1 - fit.lead - d * N
@@ -149,7 +154,7 @@ def diagnosis_of(
         *_about_held_out(validation),
         *_about_samples(data),
     )
-    # Variances decrease with the number of strides beyond that of the unknowns.
+    # Variances are proportional to one over the number of strides less the number of unknowns.
     cycles = (100, 300, 1000, 3000)
     parameters = R * nu + d + 1
     later = np.array([max(n - parameters, 0) for n in cycles], float)
@@ -165,9 +170,11 @@ def diagnosis_of(
 
 
 def slow_sampling(data: SectionData) -> Iterator[Finding]:
-    """Find outputs of which interpolation between samples loses as much as they deviate."""
-    # Noise gives up to 1.3, and would be reported below that. Above, wrong fits pass: with 10
-    # samples in a cycle, errors were up to four standard errors at 1.6 to 2.1.
+    """Find outputs whose errors of interpolation between samples are as large as their
+    deviations."""
+    # Noise has values up to 1.3, so that the limit must be higher. With a higher limit than this,
+    # wrong fits pass: with 10 samples in a cycle, errors were up to four standard errors at 1.6 to
+    # 2.1.
     if data.unresolved > 1.5:
         yield Finding(
             "sampling",
@@ -252,7 +259,7 @@ def _about_outputs(grid: CycleGrid, fit: SeriesFit) -> Iterator[Finding]:
     for i, j in combinations(range(ny), 2):
         pair = y[..., [i, j]]
         known = np.asarray(np.isfinite(pair).all(axis=2))
-        # Of an output that is constant at a section.
+        # (An output that is constant at a section has no correlation.)
         with np.errstate(invalid="ignore"):
             correlations = [np.corrcoef(pair[known[:, n], n].T)[0, 1] for n in range(N)]
         if np.median(np.nan_to_num(np.abs(correlations))) > _SAME_OUTPUTS:
@@ -275,11 +282,11 @@ def _about_multipliers(fit: SeriesFit) -> Iterator[Finding]:
 
 
 def _about_held_out(validation: Validation | None) -> Iterator[Finding]:
-    """Find what a validation on held-out strides speaks against.
+    """Find assumptions of a fit that its validation on held-out strides contradicts.
 
-    Correlation in time is no reason to doubt: smoothing and disturbances of the state cause it, and
-    standard errors allow for it. Nor are residuals below a hundredth of the output, in which the
-    test sees the distortion of small pushes if there is little noise.
+    Correlation in time is no finding: smoothing and disturbances of the state cause it, and
+    standard errors allow for it. Residuals below a hundredth of the output are no finding, either:
+    with little noise, the test notices the nonlinear response to small pushes.
     """
     if validation is None:
         return

@@ -1,4 +1,9 @@
-"""Fits that are tried on strides to which they were not fitted."""
+"""Fits that are tested on strides to which they were not fitted.
+
+`split` divides records into a part to be fitted and a part to be held out. `Split.best_order` and
+`compare_orders` choose the number of multipliers by the errors on the held-out part; `hold_out`
+fits the first part and validates the fit on the rest.
+"""
 
 from typing import NamedTuple
 
@@ -19,14 +24,15 @@ from ..identify.validation import Validation, can_be_compared, validate
 from .data import SectionData
 
 
-# Cycles from which orders are chosen and held-out fits are made. More: time. Fewer: weak
-# multipliers are missed.
+# Largest number of cycles from which orders are chosen and held-out fits are made. More: time.
+# Fewer: weak multipliers are missed.
 _ENOUGH = 1000
-# Fewest cycles at the end of a record that are held out; shorter records are fitted, or held out,
-# whole. More: few records are split. Fewer: ends that say no more than their initial condition.
+# Least number of cycles at the end of a record that are held out. Shorter records are fitted or
+# held out as a whole. More: few records are split. Fewer: the held-out part depends on its initial
+# condition only.
 _SHORTEST_END = 12
-# Relative difference of misfits that count as equal. Larger: orders are too small. Smaller: noise
-# decides.
+# Misfits count as equal if their relative difference is below this. Larger: orders are too small.
+# Smaller: noise decides.
 _AS_GOOD = 0.02
 
 
@@ -72,8 +78,8 @@ class Split(NamedTuple):
     late: list[SectionSeries]
 
     def best_order(self, most: int = 4) -> tuple[int, str]:
-        """Choose an order; see `select_order`. Return it and, if it is the largest that could be
-        tried, the obstacle to a larger one."""
+        """Choose an order; see `select_order`. Return the order; and, if it is the largest that
+        could be tried, the reason why larger ones could not be tried."""
         compared, obstacle = self.compare_orders(most)
         return compared.order, obstacle
 
@@ -122,7 +128,7 @@ class Split(NamedTuple):
             unknown = Covariance.unknown(order)
             return assemble(problem, solution, unknown, False), ""
         cycles = int(self.early.sampled.max())
-        # A quarter of the cycles is for unknowns whose number does not grow with N.
+        # (A quarter of the cycles is for unknowns whose number does not depend on N.)
         sections = max(0.75 * N * cycles / (cycles + missing), 1)
         fewer = f", or take {sections:.0f} sections" if N > 1 else ""
         return None, (
@@ -179,7 +185,7 @@ def split(data: HasRecords) -> Split:
     shortest = _SHORTEST_END * n_sections
     short = [k for k, n in enumerate(ends) if n / 4 < shortest]
     held_out = short[3::4]
-    # If all records are short, but too few to hold one out, all are cut.
+    # If all records are short and there are too few to hold one out, all are cut.
     fitted = short if held_out or len(short) < len(ends) else []
     early = []
     late = []

@@ -1,8 +1,10 @@
-"""All steps from a recording to multipliers, in one call.
+"""`identify_recording`: all steps from a recording to multipliers, in one call.
 
-`identify_recording` calls the steps in the order in which its source lists them, and computes
-nothing itself but the number of multipliers and the removal of drift. To find a wrong step, call
-them one by one: each is a public function of `hj` or `hj.recordings`."""
+It calls public functions in the order in which its source lists them, and returns their results as
+an `Identification` (or, without inputs, as a `NaturalIdentification`). Only the number of
+multipliers and the removal of drift are decided here. To find a wrong step, call the functions one
+by one.
+"""
 
 import dataclasses
 import importlib
@@ -48,7 +50,7 @@ from .sampling import DriftCycles, sample_sections, without_drift
 from .smoothing import Bandwidth
 
 
-# The meaning of the numbers, in prints and in the report.
+# Sentences on the meaning of the numbers, in prints and in the report.
 MEANING = (
     "A multiplier is the factor by which a deviation from the average cycle changes in one cycle. "
     "A modulus below 1 is stable; the smaller, the faster the return.",
@@ -58,8 +60,8 @@ MEANING = (
 )
 
 
-# Most multipliers that are tried without inputs. More: noise of four numbers and more hides in the
-# largest modulus. Fewer: gait with two pairs is doubted.
+# Largest number of multipliers that is tried without inputs. More: noise of four numbers and more
+# hides in the largest modulus. Fewer: gait with two pairs is doubted.
 _MOST_NATURAL = 4
 
 
@@ -260,7 +262,7 @@ def identify_recording(
     if drift is not None:
         whole = whole.with_drift(drift)
     data = whole.of_inputs(inputs)
-    # In a loop all that happens begins at the reference.
+    # (In a loop, responses begin at the reference.)
     driving = data if outside is None else whole.of_inputs(outside)
     findings = inspect_cycles(recording, phase, driving)
     refuse([*inspection.findings, *findings])
@@ -302,7 +304,7 @@ def identify_recording(
 def _natural(
     recording: Recording, phase: Phase, data: SectionData, order: int | None
 ) -> NaturalIdentification:
-    """Return the multipliers from variability, and what there is to doubt.
+    """Return the multipliers from variability, with findings.
 
     **Raises:** `DefinitionError` for a number of multipliers that is given and too large, and for
     too few cycles.
@@ -324,8 +326,9 @@ def _natural(
 
 
 def _first_that_agrees(data: SectionData) -> NaturalMultipliers:
-    """Return the fewest multipliers, up to 4, of which the largest agrees with that of one more.
-    If none do, return the most that the data allow."""
+    """Return the estimate with the fewest multipliers (up to 4) whose largest modulus agrees with
+    that of an estimate with one more. If there is none, return the largest number that the data
+    allow."""
     fit = natural_multipliers(data, 1)
     for order in range(2, _MOST_NATURAL + 1):
         if not any(finding.cause == "order" for finding in fit.findings):
@@ -338,7 +341,7 @@ def _first_that_agrees(data: SectionData) -> NaturalMultipliers:
 
 
 def _is_of_events_alone(data: SectionData, phase: Phase) -> bool:
-    """Return whether one input acts on a rhythm of which only the times of events are known."""
+    """Return whether the data are one input and the times of events, without other outputs."""
     stretches = itertools.chain.from_iterable(phase.stretches)
     of_events = all(stretch.linear for stretch in stretches)
     return data.outputs == ("duration",) and len(data.inputs) == 1 and of_events
@@ -362,8 +365,8 @@ def _phase_without_drift(
 ) -> tuple[Recording, Phase]:
     """Return the recording without drift, and its phase.
 
-    The phase of the drifting signals tells where cycles begin; where a definition is given, the
-    phase is estimated again from signals without drift.
+    The phase of the drifting signals is only used to remove the drift. If a definition of the phase
+    is given, the phase is then estimated again from the signals without drift.
     """
     if isinstance(phase, Phase):
         if drift is not None:
@@ -382,7 +385,7 @@ def _order(
     data: SectionData,
     parts: Split,
 ) -> tuple[int, list[Finding]]:
-    """Return the order that predicts held-out strides best, or the given one, and doubts about
+    """Return the given order, or the order that predicts held-out strides best, and findings about
     it."""
     if order is None:
         best, obstacle = parts.best_order()
@@ -407,8 +410,8 @@ def _order_in_loop(
     data: SectionData,
     references: Sequence[str],
 ) -> tuple[int, list[Finding]]:
-    """Return the largest order that the reference determines, or the given one, and doubts about
-    it."""
+    """Return the given order, or the largest order that the reference determines, and findings
+    about it."""
     if order is None:
         best, obstacle = best_order(data, references, most=4)
         return best, untried_orders(best, obstacle)

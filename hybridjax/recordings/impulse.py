@@ -1,4 +1,10 @@
-"""Phase-dependent impulse responses: the effect of a brief push at each phase, and its duration."""
+"""Phase-dependent impulse responses: the effect of a brief push on the outputs, by the phase of the
+push and the time since the push.
+
+`impulse_responses` computes them from a `SeriesFit`, with standard errors, and returns
+`ImpulseResponses`. The response continues beyond the fitted lags by the recursion from cycle to
+cycle (`whole`). A push is as short as the band of the input allows (`_push`, `_smeared`).
+"""
 
 from typing import Annotated, Any
 
@@ -20,11 +26,11 @@ from .data import WHOLE_BAND, SectionData, input_band
 from .smoothing import Series
 
 
-# Standard deviations of the push's spectrum up to the edge of the band, where 4 % are left of it.
-# More: wide pushes. Fewer: power beyond the band.
+# The edge of the band is at this many standard deviations of the push's spectrum, where 4 % are
+# left. More: pushes are wider. Fewer: the push has power beyond the band.
 _SPECTRUM_REACH = 2.5
-# Standard deviations at which the push is cut off, where 1 % of its peak is left. More: time.
-# Fewer: the push has edges.
+# The push is cut off at this many standard deviations, where 1 % of its peak is left. More: pushes
+# take longer. Fewer: the push begins and ends with a jump.
 _PUSH_REACH = 3
 
 Responses = Float[np.ndarray, "N lags ny nu"]
@@ -173,7 +179,8 @@ def impulse_responses(
             f"`width` {width:g} is too large for responses of {cycles:g} cycles: lower it, or "
             "raise `cycles`."
         )
-    # Responses to inputs of one section continue by the recursion from cycle to cycle.
+    # Beyond the fitted lags, responses to an input at one section follow a recursion from cycle to
+    # cycle.
     recursion = np.zeros(len(fit.coefficients) * N + 1)
     recursion[::N] = [1.0, *fit.coefficients]
     longest = max(fit.lead + lags + reach, R)
@@ -235,7 +242,8 @@ def _durations(data: SectionData) -> Series:
 
 
 def _smeared(h: np.ndarray, push: Series) -> np.ndarray:
-    """Return responses to a push of several sections, from those to one; lags come first."""
+    """Return responses to a push that lasts for several sections, from responses to a push of one
+    section. The first axis has the lags."""
     return np.asarray(ndimage.correlate1d(h, push, axis=0, mode="constant"))
 
 
@@ -252,7 +260,8 @@ def _by_push(
     durations: Series,
     push: Series,
 ) -> Responses:
-    """Responses to a push of area 1 by its section, from those by the section of the response."""
+    """Responses to a push of area 1, indexed by the section of the push, from responses indexed by
+    the section of the output."""
     N = len(durations)
     area = ndimage.correlate1d(durations, push, mode="wrap")
     m = np.arange(N)[:, None]

@@ -1,13 +1,18 @@
 r"""Multipliers from natural variability, with intervals by a block bootstrap.
 
 With $x_k$ the state at a section in cycle k, $x_{k+1} = J x_k + w_k$, and $z_k = x_k + v_k$ is
-measured. Least squares on $z_k$ gives $J \Sigma_x (\Sigma_x + \Sigma_v)^{-1}$: noise biases towards
-fast decay. States $q_k$ at earlier sections of the same cycle depend on $x_k$, but not on its
-noise, and not on what happens after it; so
+measured. Least squares on $z_k$ gives $J \Sigma_x (\Sigma_x + \Sigma_v)^{-1}$: noise of measurement
+biases towards fast decay. States $q_k$ at earlier sections of the same cycle are correlated with
+$x_k$, but not with the noise $v_k$ and the later disturbance $w_k$; so
 
 $$J = E[z_{k+1} q_k^T] \, E[z_k q_k^T]^{+}$$
 
 has no such bias (instrumental variables, two-stage least squares: Söderström and Stoica 1983).
+
+`natural_multipliers` calls `_estimate`: `_moments` computes the products for each cycle and
+section, these are summed with weights (all cycles first, then the draws of the bootstrap,
+`_resampled`), and `_multipliers` gives the result. `_corrected` removes the bias of short records.
+Wrong multipliers have their cause in `_moments` or `_corrected`, wrong intervals in `_resampled`.
 """
 
 import dataclasses
@@ -39,21 +44,24 @@ from .inspection.differences import alternating_cycles
 
 # Draws of the bootstrap. More: time. Fewer: the ends of intervals scatter.
 _DRAWS = 1000
-# Cycles of a block, in units of the third root of their number. More: few blocks. Fewer: errors
-# of successive cycles, which all sections have in common, are cut apart, and intervals too narrow.
+# Number of cycles of a block, in units of the third root of the number of all cycles. More: there
+# are few blocks. Fewer: successive cycles, whose errors are correlated, fall into different blocks,
+# and intervals are too narrow.
 _BLOCK = 2.0
-# Fewest cycles of a block, and of blocks in a record, below which whole records are drawn. More:
-# few blocks. Fewer: memory of disturbances is cut.
+# Least number of cycles of a block, and of blocks in a record; with fewer blocks, whole records are
+# drawn. More: there are few blocks. Fewer: blocks are shorter than correlations of disturbances
+# last.
 _SHORTEST_BLOCK = 4
-# Number of sections of a state, of sections between a state and its instruments, and of
-# combinations of the instruments per dimension of the state. More: weak instruments, and a first
-# stage that follows noise. Fewer: smoothing correlates their noise, and directions are missed.
+# Three numbers are equal to this: of sections in a state, of sections between a state and its
+# instruments, and of combinations of instruments per dimension of the state. More: weak
+# instruments, and a first stage that follows noise. Fewer: smoothing correlates the noise of state
+# and instruments, and directions are missed.
 _EACH = 2
-# Modulus of multipliers of draws, at most, for which a bias is computed. Larger: it is infinite.
-# Smaller: slow multipliers keep a part of it.
+# Largest modulus of multipliers for which a bias is computed; larger ones get the bias of this
+# modulus. Larger: infinite bias. Smaller: a part of the bias is left in slow multipliers.
 _STABLE = 0.99
-# Least variance of a combination of states, relative to the largest. Larger: small ones count as
-# larger. Smaller: noise of covariances is amplified.
+# Variances of combinations of states are at least this part of the largest one. Larger: small
+# variances are overstated. Smaller: noise of covariances is amplified.
 _LEAST_VARIANCE = 1e-3
 
 Draws = Complex[np.ndarray, "B d"]
@@ -74,8 +82,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
     - `strength`: fraction of the states' variance that the instruments explain.
     - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
       `block`: cycles of a block; those of a record, where whole records are drawn.
-    - `findings`: reasons to doubt the multipliers. One of them is that one multiplier more changes
-      the largest modulus, as one for slow drift of the outputs does.
+    - `findings`: reasons to doubt the multipliers. There is one if a further multiplier, such as
+      one for slow drift of the outputs, changes the largest modulus.
     """
 
     multipliers: Complex[np.ndarray, " d"]
@@ -113,7 +121,7 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
 
     @property
     def covariance(self) -> Float[np.ndarray, "d d"]:
-        """That of the coefficients, over the resamplings."""
+        """Covariance of the coefficients, over the resamplings."""
         polynomials = [coefficients_of(x) for x in self.draws]
         d = len(self.multipliers)
         return np.cov(polynomials, rowvar=False).reshape(d, d)
@@ -148,8 +156,8 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         return (low <= modulus) & (modulus <= high)
 
     def compare(self, other: Truth) -> MultiplierComparison:
-        """Pair the multipliers with true ones, or with those of another fit. There is no test: see
-        `interval`.
+        """Pair the multipliers with true multipliers, or with the multipliers of another fit. There
+        is no test: see `interval`.
 
         **Example:**
 
@@ -212,8 +220,9 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
 def _moduli(
     values: Complex[np.ndarray, " d"], draws: Draws
 ) -> Float[np.ndarray, "B d"]:
-    """Return the moduli of draws. Where the estimates are a complex pair, both have the root of the
-    product: draws may be two real numbers, one larger and one smaller than the modulus."""
+    """Return the moduli of draws. If the estimates are a complex pair, both get the square root of
+    the product of the two draws, since these may be two real numbers, one larger and one smaller
+    than the modulus."""
     moduli = np.abs(draws)
     for k in np.flatnonzero(values.imag > 0):
         distance = np.abs(values - values[k].conj())
@@ -326,7 +335,7 @@ def _contains(result: NaturalMultipliers, other: NaturalMultipliers) -> bool:
 
 
 def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
-    """Estimate so many multipliers, without a second number of them."""
+    """Estimate `order` multipliers. (Another order is not tried.)"""
     moments = _moments(data, order)
     K = len(moments.records)
     _, counts = np.unique(moments.records, return_counts=True)
@@ -334,10 +343,10 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     block = max(_SHORTEST_BLOCK, by_length)
     are_short = np.median(counts) < _SHORTEST_BLOCK * block
     if are_short and len(counts) >= _SHORTEST_BLOCK:
-        # (Many short records are drawn as wholes.)
+        # (Many short records: whole records are drawn.)
         block = int(counts.max())
     rng = np.random.default_rng(seed)
-    # The first weights are those of all cycles, the others draws.
+    # The first row of weights is that of the estimate (all cycles once), the others are draws.
     weights = np.vstack([np.ones(K), _resampled(moments.records, block, rng)])
     state, forward, square, cross, ahead = (
         np.tensordot(weights, products, (1, 1)) for products in moments[:5]
@@ -346,7 +355,8 @@ def _estimate(data: SectionData, order: int, seed: int) -> NaturalMultipliers:
     first_stage = np.linalg.pinv(square, hermitian=True) @ cross.mT
     second_stage = np.linalg.pinv(cross @ first_stage)
     by_instruments = ahead @ first_stage @ second_stage
-    # (With the noise of the states: without it, weak instruments give variances near zero.)
+    # (The covariance includes the noise of the states: without it, weak instruments give variances
+    # near zero.)
     mean_length = K / len(counts)
     maps = _corrected(by_instruments, state / K, mean_length)
     multipliers = _multipliers(maps)
@@ -409,7 +419,8 @@ def _moments(data: SectionData, order: int) -> _Moments:
         )
 
     def values(shift: int, count: int) -> Float[np.ndarray, "rows k"]:
-        """Return the outputs of so many sections, the last one `shift` before the state."""
+        """Return the outputs at `count` sections, the last of which is `shift` sections before the
+        state."""
         return np.array(
             [
                 (data.records[s].y[k - shift - np.arange(count)] / size).ravel()
@@ -453,7 +464,7 @@ def _rows(data: SectionData) -> Int[np.ndarray, "rows 4"]:
     """Return record, cycle, section and sample of all states that have instruments before them and
     a next state."""
     N = data.n_sections
-    before = 3 * _EACH  # (of instruments there is one section more)
+    before = 3 * _EACH  # (instruments need one section more)
     rows = [np.zeros((0, 4), int)]
     for s, record in enumerate(data.records):
         sample = np.arange(before, len(record.y) - N)
@@ -475,7 +486,8 @@ def _principal(
     other: Float[np.ndarray, "k p"],
     count: int,
 ) -> tuple[Float[np.ndarray, "k d"], Float[np.ndarray, "k d"]]:
-    """Return both in the combinations along which the first varies most, with its variance 1."""
+    """Return both arguments in the combinations of columns along which the first one varies most,
+    scaled to variance 1."""
     mean = x.mean(axis=0)
     _, s, axes = np.linalg.svd(x - mean, full_matrices=False)
     rounding = 1e-9 * s[0]
@@ -518,14 +530,14 @@ def _corrected(
     covariance: Float[np.ndarray, "B N d d"],
     length: float,
 ) -> Float[np.ndarray, "B N d d"]:
-    r"""Return maps without the bias of first order that the unknown mean of each record, and
-    regression on the past, make in records of so many cycles (Nicholls and Pope 1988):
+    r"""Return maps without the bias of first order by the unknown mean of each record and by
+    regression on the past (Nicholls and Pope 1988). In records of a given length, the bias is
 
     $$-G \left[(I - J^T)^{-1} + J^T (I - J^T J^T)^{-1}
     + \sum_i \lambda_i (I - \lambda_i J^T)^{-1}\right] \Sigma^{-1}$$
 
-    over the length, with $G = \Sigma - J \Sigma J^T$ the covariance of the disturbances. For one
-    multiplier this is Kendall's (1 + 3 z) / length.
+    divided by the length, with $G = \Sigma - J \Sigma J^T$ the covariance of the disturbances. For
+    one multiplier this is Kendall's (1 + 3 z) / length.
     """
     d = maps.shape[-1]
     eye = np.eye(d)
@@ -533,7 +545,7 @@ def _corrected(
     carried = maps @ state @ maps.mT
     disturbances = _positive(state - carried)
     values = np.linalg.eigvals(maps)
-    # (Of unstable draws, the bias at the edge of stability.)
+    # (Unstable draws get the bias at the edge of stability.)
     largest = np.abs(values).max(axis=-1)
     inside = np.minimum(1.0, _STABLE / np.maximum(largest, _STABLE))
     values = values * inside[..., None]
@@ -547,7 +559,8 @@ def _corrected(
         by_value = value * np.linalg.inv(eye - value * back)
         sums = sums + by_value.real
     change = disturbances @ sums @ np.linalg.inv(state) / length
-    # (Of d equal multipliers it is 3 + d at most; maps far from normal would be moved without end.)
+    # (For d equal multipliers, the change is at most 3 + d; for maps far from normal, it could be
+    # arbitrarily large.)
     largest_change = (3 + d) / length
     norm = np.linalg.norm(change, 2, axis=(-2, -1))
     size = norm[..., None, None]
@@ -570,8 +583,8 @@ def _resampled(
     block: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "B K"]:
-    """Draw blocks of each record, or whole records, and return how often each cycle is in each
-    draw."""
+    """Draw blocks of each record (or whole records) with replacement. Return how often each cycle
+    occurs in each draw."""
     names, place, counts = np.unique(records, return_inverse=True, return_counts=True)
     weights = np.zeros((_DRAWS, len(records)))
     if block == counts.max():

@@ -1,4 +1,8 @@
-"""The number of multipliers that HTFs, or data, support."""
+"""`select_order`: the number of multipliers that HTFs or data support.
+
+HTFs are compared in `identify/multipliers.py` (`compare_orders`), data on held-out cycles
+(`held_out.py`).
+"""
 
 from typing import overload
 

@@ -1,4 +1,9 @@
-"""The phase of a recording."""
+"""`Phase`: the phase of all trials of a recording, as `estimate_phase` returns it.
+
+Each trial has stretches (`Winding`) without long gaps, in which time and phase determine each
+other. `samples` and `by_trial` give data and stretches together. The phase itself is computed in
+`phase_estimation.py`.
+"""
 
 from typing import Any
 
@@ -18,11 +23,13 @@ from .recording import Recording, Trial
 from .smoothing import Series
 
 
-# Longest gap, in cycles, across which cycles are counted. Longer: half a turn of an angle passes
-# unnoticed, and the count is wrong. Shorter: stretches end at every missing sample of a slow rate.
+# Longest gap, in cycles, across which cycles are counted. Longer: half a revolution of an angle may
+# be missed, and the count is wrong. Shorter: at low sampling rates, stretches end at every missing
+# sample.
 LONGEST_GAP = 0.25
-# Harmonics of a cycle that are resolved by default: sections, and the bandwidth of the signals of
-# an angle. More: noisier phases, more unknowns. Fewer: impacts and other fast parts are smeared.
+# Number of harmonics of a cycle that are resolved by default. It sets the number of sections, and
+# the bandwidth of the signals of an angle. More: noisier phases, more unknowns. Fewer: impacts and
+# other fast parts are smeared.
 HARMONICS = 32
 
 
@@ -158,7 +165,8 @@ class Phase(Showable, eqx.Module):
 
     @property
     def jitter(self) -> float:
-        """Relative standard deviation of the periods of each trial about their line."""
+        """Relative standard deviation of the periods about a straight line through the periods of
+        each trial."""
         residuals = [signal.detrend(p) for p in self.periods if len(p) > 2]
         dof = sum(len(x) - 2 for x in residuals)
         square = sum(x @ x for x in residuals) / max(dof, 1)

@@ -1,4 +1,10 @@
-"""From a definition of phase to the phase of a recording: angles that wind, events, crossings."""
+"""`estimate_phase`: from a definition of phase to the phase of a recording.
+
+There are three ways: by the angle of two signals (`_from_angles`), by crossings of a smooth signal
+(`_from_crossings`) and by events (`_from_events`); each returns a `Phase`. For events, `_rhythm`
+decides which intervals are too short (doubled events) or too long (missed events): look there if
+cycles are lost or counted twice.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
@@ -29,14 +35,16 @@ from .smoothing import (
 PhaseDefinition: TypeAlias = KinematicPhase | Crossing | AtEvent
 """Definition of the phase of a recording; see `estimate_phase`."""
 
-# Number of intervals from which the rhythm of a trial is estimated alone. More: long trials are
-# judged by the period of the others. Fewer: it is estimated from too few.
+# The rhythm of a trial is estimated from the trial alone if it has this many intervals. More: long
+# trials are judged by the period of other trials. Fewer: it is estimated from too few intervals.
 _ENOUGH = 20
-# Fraction of long intervals that makes them part of the rhythm. Larger: rhythms of long and short
-# cycles are cut at each long one. Smaller: missed events pass for cycles.
+# Long intervals are part of the rhythm if they are more than this part of all intervals. Larger: in
+# rhythms of long and short cycles, each long cycle counts as a missed event. Smaller: missed events
+# pass for cycles.
 _COMMON = 0.1
-# Part of its range by which a switch jumps, and between its values; and part of its samples at
-# these. Larger: noisy triggers are smoothed, and lost. Smaller: waves (41 %) are not smoothed.
+# A signal is a switch if it jumps by this part of its range, and if this part of its samples is at
+# its two values. Larger: noisy triggers are smoothed, and lost. Smaller: waves (41 %) are not
+# smoothed.
 _SWITCHED = 0.8
 
 
@@ -120,8 +128,8 @@ def _from_crossings(
 
 
 def _is_switched(recording: Recording, crossing: Crossing, name: str) -> bool:
-    """Return whether a signal stays at two values and jumps at its marked crossings, as that of a
-    trigger does. Smoothing would move its crossings, or remove them with its pulses."""
+    """Return whether a signal stays at two values and jumps at its marked crossings, like the
+    signal of a trigger. Smoothing would move the crossings, or remove short pulses."""
     shares = []
     at_two_values = []
     for trial, x in recording.samples(signal_of(crossing)):
@@ -131,7 +139,7 @@ def _is_switched(recording: Recording, crossing: Crossing, name: str) -> bool:
         at_two_values.append(is_at_one[np.isfinite(x)].mean())
         after = np.searchsorted(trial.time, trial.events[name])
         after = np.clip(after, 1, len(x) - 1)
-        # A sampled edge may lie on the level, or on a sample.
+        # (A sample of an edge may lie between the two values.)
         last = np.minimum(after + 1, len(x) - 1)
         first = np.maximum(after - 2, 0)
         within = x[after] - x[after - 1]
@@ -154,11 +162,12 @@ def signals_of(definition: PhaseDefinition) -> set[str]:
 
 
 _Angle = tuple[Series, Series]
-"""Times, and an angle of one trial in rad, modulo whole turns; section 0 lies at 0."""
+"""Times, and an angle of one trial in rad, modulo 2 pi; section 0 lies at 0."""
 
 
 def _from_angles(angles: Sequence[_Angle], n_sections: int) -> Phase:
-    """Return the phase of all trials: their angles in the sense in which they turn."""
+    """Return the phase of all trials from angles. (The phase grows in the direction in which the
+    angles go round.)"""
     rate = _turns_per_time(angles)
     backwards = 0
     total = 0
@@ -243,8 +252,8 @@ def _at_common_times(
     time: Series,
     signals: Float[np.ndarray, "n 2"],
 ) -> Float[np.ndarray, "n 2"]:
-    """Interpolate two signals with clocks of their own, each at the times of the other, not in
-    gaps."""
+    """Interpolate two signals with different sampling times, each at the times of the other one,
+    but not in gaps."""
     finite = np.isfinite(signals)
     fewest = finite.sum(axis=0).min()
     if finite.all(axis=1).sum() > fewest / 2 or fewest < FEWEST:
@@ -382,8 +391,9 @@ class _Rhythm(NamedTuple):
 def _rhythm(intervals: Series) -> _Rhythm:
     """Return the rhythm of a trial.
 
-    Irregular rhythms have intervals of all lengths: the limits lie at the first gap in their
-    distribution on either side of the median (0.25 periods above, 0.1 below).
+    Irregular rhythms have intervals of many lengths. The limits therefore lie at the first gap in
+    the distribution of intervals on either side of the median. (A gap is 0.25 periods wide above
+    the median, and 0.1 below.)
     """
     period = _period(intervals)
     length = np.sort(intervals / period)
@@ -403,8 +413,9 @@ def _rhythm(intervals: Series) -> _Rhythm:
 
 
 def _period(intervals: Series) -> float:
-    """Return the median of the intervals without short ones, of which a doubled event makes one:
-    less than a quarter of the interval that half of the time is spent below."""
+    """Return the median of the intervals, without the short ones that doubled events cause. An
+    interval is short if it is less than a quarter of a typical one. (Half of the time is spent in
+    intervals shorter than the typical one.)"""
     ascending = np.sort(intervals)
     spent = np.cumsum(ascending)
     usual = ascending[np.searchsorted(spent, spent[-1] / 2)]

@@ -1,4 +1,9 @@
-"""Recordings from files."""
+"""`read_recording`: recordings from files.
+
+The suffix of a file selects a reader in `formats/` (`read_tables`), which returns tables of
+columns. Here they become a `Recording` with one trial for each file. A reader for another format is
+added in `formats/`, and to the readers here.
+"""
 
 import os
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,10 @@
-"""What a laboratory recorded: sampled signals, events, units, in one or several trials."""
+"""`Recording`: what a laboratory recorded, that is, sampled signals and events with units, in one
+or several trials.
+
+Nothing is resampled or filled in: a missing sample is NaN. The constructor checks the arrays;
+`join` and `beside` combine recordings, and `mark` adds events. Errors about times come from
+`_require_increasing`.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -46,7 +52,7 @@ class Trial(eqx.Module):
     name: str = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        # (JAX makes trees with other leaves of it.)
+        # (JAX may make a `Trial` whose leaves are not arrays.)
         is_series = isinstance(self.time, np.ndarray) and len(self.time) > 1
         return f"Trial({_summary(self).strip() if is_series else self.name})"
 
@@ -201,7 +207,7 @@ class Recording(Showable, eqx.Module):
 
     @staticmethod
     def beside(recordings: Iterable["Recording"]) -> "Recording":
-        """Combine signals that were recorded side by side, each with times of its own.
+        """Combine signals that were recorded at the same time, each with its own sampling times.
 
         All share one time axis, on which a signal is missing (NaN) where it was not sampled:
         nothing is interpolated. Trials of the same position belong together; their times must count
@@ -411,7 +417,7 @@ def _require_increasing(where: str, time: Series) -> None:
     if not after < before:
         remedy = "leave out such samples"
     elif _begins_again(time, bad):
-        # From the last sample before the fall to the first after it, a step passes.
+        # (One step passes from the last sample before the fall to the first sample after it.)
         period = before - after + float(np.nanmedian(np.diff(finite)))
         remedy = (
             "if the clock wraps, undo it (`numpy.unwrap` with "
@@ -426,8 +432,8 @@ def _require_increasing(where: str, time: Series) -> None:
 
 
 def _begins_again(time: Series, bad: int) -> bool:
-    """Return whether time falls at sample `bad` by more than half of its range so far, and goes on
-    from there."""
+    """Return whether time begins again at sample `bad`: it falls by more than half of its range so
+    far, and increases afterwards."""
     so_far = np.ptp(time[:bad])
     after = time[bad : bad + 3]
     rises = bool((np.diff(after) > 0).all())
@@ -454,7 +460,8 @@ def check_events(
     at: Series,
     time: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, " k"]:
-    """Return the events within the recording, or one sample outside of it.
+    """Return the events within the recording. (One sample before its start, or after its end, is
+    allowed.)
 
     **Raises:** `DefinitionError` if all events lie outside.
     """

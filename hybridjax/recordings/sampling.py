@@ -1,9 +1,12 @@
-"""From sampled signals to data at the sections of a cycle, and the removal of slow drift.
+"""`sample_sections`: from sampled signals to data at the sections of a cycle; and `without_drift`,
+the removal of slow drift.
 
 `sample_sections` takes the stages in order, trial by trial (`_sample_trials`): isolated spikes are
 left out, splines through the outputs are evaluated where the phase crosses a section (`_Output`),
 inputs become one value for each interval between sections (`_held`), and the average cycle is
-subtracted. `_records` then makes a record of each stretch of the phase.
+subtracted. `_records` then makes a record of each stretch of the phase, and the result is a
+`SectionData`. A wrong output has its cause in `_Output`, an input that is shifted by a section in
+`_held`.
 """
 
 from collections.abc import Sequence
@@ -167,7 +170,8 @@ def sample_sections(
 
 
 class _Plan(NamedTuple):
-    """How all trials are sampled; the fields are those of `sample_sections`."""
+    """Options of sampling, the same for all trials. The fields are the arguments of
+    `sample_sections`."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -241,7 +245,7 @@ def _sample_trials(
         spikes += counts
         for name, x in zip(plan.signals, signals.T, strict=True):
             samples = int(np.isfinite(x).sum())
-            # A half of them is left out to see what interpolation loses.
+            # (One half of the samples is left out to estimate the error of interpolation.)
             if samples < 2 * FEWEST:
                 raise DefinitionError(
                     f"trial '{trial.name}' has {samples} samples of {name}: leave the trial out."
@@ -321,7 +325,8 @@ def _without_spikes(
 
 
 def _counted_through(stretches: Sequence[Winding]) -> tuple[Series, Series]:
-    """Return times and phases of all stretches of a trial, each of which begins in a new cycle."""
+    """Return times and phases of all stretches of a trial, counted on such that each stretch begins
+    in a new cycle."""
     times = [np.zeros(0)]
     phases = [np.zeros(0)]
     cycle = 0.0
@@ -357,12 +362,13 @@ def _require_changes(
 
 
 def _require_times(part: _Sections, N: int, step: float) -> None:
-    """**Raises:** `DefinitionError` for times that deviate by rounding, or by interpolation, whose
-    errors depend on the place of a crossing between samples, which are `step` seconds apart."""
+    """**Raises:** `DefinitionError` for times of crossing whose deviations are errors of rounding
+    or interpolation. (Errors of interpolation depend on the position of a crossing between samples,
+    which are `step` seconds apart.)"""
     is_anchor = part.k % N == 0
     known = is_anchor & np.isfinite(part.values[:, -1])
     inner = np.flatnonzero(known)[3:-3]
-    # Of fewer cycles, the seven waves below explain too much.
+    # (With fewer cycles, the seven waves below would explain too much.)
     if len(inner) <= 20:
         return
     t = part.t[inner]
@@ -371,7 +377,7 @@ def _require_times(part: _Sections, N: int, step: float) -> None:
     angle = 2 * np.pi * np.outer(place, np.arange(4))
     waves = np.exp(1j * angle).view(float)
     unexplained = late - waves @ np.linalg.lstsq(waves, late)[0]
-    # Of interpolation errors 0.4 % are left, of deviations by the rhythm 95 %.
+    # (After regression, 0.4 % of interpolation errors are left, but 95 % of real deviations.)
     allowed = 0.1 * late.std() + ROUNDING * t[-1]
     if unexplained.std() <= allowed:
         raise DefinitionError(
@@ -387,7 +393,7 @@ def _sample(
     stretches: Sequence[Winding],
     plan: _Plan,
 ) -> list[_Sections]:
-    """Sample the signals of a trial in all stretches of a whole cycle; NaN in gaps."""
+    """Sample the signals of a trial in all stretches of at least one cycle; NaN in gaps."""
     N = plan.n_sections
     nu = len(plan.inputs)
     of_output = [_Output.through(time, x, plan) for x in signals.T[nu:]]
@@ -498,8 +504,8 @@ def _after_clock(
     times: list[Series],
     plan: _Plan,
 ) -> list[Series]:
-    """Return times minus those of the clock: a line through the times of each section,
-    t = T cycle + a[section], all with the same slope T. Cycles are counted through gaps."""
+    """Return the deviations of times from those of an even rhythm, t = T cycle + a[section], with
+    one period T for all sections. Cycles are counted across gaps."""
     N = plan.n_sections
     first = parts[0]
     begin = first.t[0] / plan.period - first.k[0] / N
@@ -542,7 +548,7 @@ def without_drift(
         for k in columns:
             smooth = smoothing.without_spikes(values[:, k])
             middle, level = cycle_means(trial, smooth, stretches, phase.period)
-            # (A constant drift is the mean, which stays.)
+            # (A constant drift is the mean, which is kept.)
             if len(middle) >= FEWEST and cycles < np.inf:
                 bandwidth = 0.5 / (cycles * phase.period)
                 drift = spline(middle, level - level.mean(), bandwidth)

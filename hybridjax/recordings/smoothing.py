@@ -1,4 +1,9 @@
-"""Splines through samples with a stated bandwidth, gaps between samples, and isolated spikes."""
+"""Splines through samples with a stated bandwidth, gaps between samples, and isolated spikes.
+
+All files of `recordings` that evaluate a signal between its samples call `spline` (or `means`), and
+ask `bridgeable` and `gaps` which gaps are too long. `spike_heights` finds isolated wrong samples.
+Time series are arrays (n,), with NaN for missing samples.
+"""
 
 from typing import Annotated, Any
 
@@ -19,8 +24,8 @@ Series = Float[np.ndarray, " n"]
 Bandwidth = Annotated[float, Number("a positive number", above=0, infinite=True)]
 """In Hz; infinite: nothing is smoothed."""
 
-# Bandwidth, in cycles per sample, at which a spline is a straight line. Smaller: its weight
-# overflows. Larger: slow changes of long recordings are not passed.
+# With a bandwidth below this, in cycles per sample, a spline is a straight line. Smaller: its
+# weight overflows. Larger: slow changes of long recordings are removed.
 _STRAIGHT = 1e-12
 # Fewest samples of a spline. More: short stretches are left out. Fewer than 3: the band matrix is
 # empty.
@@ -31,23 +36,24 @@ _LONGEST = 3
 # Number of neighboring samples with which a spike is compared. More: spikes where a signal is steep
 # are missed. Fewer: their median is a spike itself.
 _NEIGHBORHOOD = 3 * _LONGEST
-# Least height of a spike in ranges of the closest half of its neighbors (for an input also of its
-# middle 98 %; for a number that stands for no value, of all samples), and in standard deviations of
-# the noise (or smallest steps of the signal). Larger: spikes stay in. Smaller: steep parts, noise,
-# rounding and the perturbation itself are left out.
+# Least height of a spike: this many ranges of the closest half of its neighbors, and a number of
+# standard deviations of the noise (or smallest steps of the signal). For an input, the range of its
+# middle 98 % counts, too; for placeholders such as -9999, the range of all samples. Larger: spikes
+# stay in. Smaller: steep parts, noise, rounding and the perturbation itself are left out.
 RANGES = 3.0
 _NOISES = 6.0
-# Spikes are isolated if within so many samples on either side there are no more of them than two
-# longest spikes have. Fewer: ringing after an impact is taken for spikes. More: independent spikes
-# nearby stay in.
+# A spike is isolated if within this many samples on either side there are no more wrong samples
+# than two longest spikes have. Fewer: ringing after an impact is taken for spikes. More:
+# independent spikes nearby stay in.
 _NEAR = 10
-# Transients within this many cycles, with heights within a factor of `RANGES`, are alike, and part
-# of the motion if they occur in half of the cycles. Larger: spikes that are near each other by
-# chance stay in. Smaller: impacts in a jittering rhythm are left out.
+# Spikes are alike if their phases differ by less than this part of a cycle, and their heights by
+# less than the factor `RANGES`. If they occur in half of the cycles, they are part of the motion.
+# Larger: spikes that are near each other by chance are kept. Smaller: impacts in a jittering rhythm
+# are left out.
 _SAME_PHASE = 0.01
-# Fraction of an input's standard deviation that is noise from sample to sample, up to which it
-# counts as smooth. Larger: single samples of white inputs are taken for spikes. Smaller: spikes of
-# noisy inputs stay in.
+# An input is smooth if the noise from sample to sample is below this part of its standard
+# deviation. Larger: single samples of white inputs count as spikes. Smaller: spikes of noisy inputs
+# are kept.
 _SMOOTH_INPUT = 0.3
 
 
@@ -55,10 +61,10 @@ def spline(time: Series, values: Series, bandwidth: int | float) -> CubicSpline:
     r"""Return a natural cubic spline through samples; NaN are left out.
 
     A finite bandwidth b (Hz) makes it a smoothing spline (Reinsch 1967; Green and Silverman,
-    *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): the minimizer of
-    $\sum (y_i - f(t_i))^2 + \gamma \int f''^2$ passes a sine of frequency $f$ with the gain
-    $1 / (1 + \gamma h (2 \pi f)^4)$, h the time between samples, and $\gamma$ is chosen so that
-    this is one half at b.
+    *Nonparametric Regression and Generalized Linear Models*, 1994, sec. 2.3): it minimizes $\sum
+    (y_i - s(t_i))^2 + \gamma \int s''^2$ over functions s. A sine of frequency $f$ passes with the
+    gain $1 / (1 + \gamma h (2 \pi f)^4)$, where h is the time between samples, and $\gamma$ is
+    chosen so that the gain is one half at b.
     """
     finite = np.isfinite(values)
     count = int(finite.sum())
@@ -116,8 +122,8 @@ def bridgeable(time: Series, longest: int | float = 0.0) -> float:
 
 
 def gaps(time: Series, longest: int | float) -> Float[np.ndarray, "g 2"]:
-    """Return the intervals without samples that are longer than `longest`, from the one before all
-    samples, which starts at -inf, to the one after them."""
+    """Return the intervals without samples that are longer than `longest`, including the interval
+    before all samples, which starts at -inf, and the one after all samples."""
     edges = np.concatenate([[-np.inf], time, [np.inf]])
     intervals = sliding_window_view(edges, 2)
     return intervals[np.diff(edges) > longest]
@@ -154,12 +160,13 @@ def without_spikes(values: Series) -> Series:
 def spike_heights(values: Series) -> Series:
     r"""Return the signed height of each sample of an isolated spike, and zero elsewhere.
 
-    Spikes of up to three samples are what an opening (or closing) of a signal removes: the largest
-    of the least values of four successive samples (top hat: Serra, *Image Analysis and Mathematical
-    Morphology*, 1982). Steps, kinks and pulses of four samples or more pass. A candidate is a spike
-    if its distance from the median of its neighbors (Hampel 1974) exceeds three times the range of
-    the closest half of them, six standard deviations of the noise, and six of the smallest steps of
-    the signal, and if few others are nearby, as they are where a signal rings.
+    Candidates are samples that an opening of the signal (or a closing) removes: the opening is the
+    largest of the least values of four successive samples (top hat: Serra, *Image Analysis and
+    Mathematical Morphology*, 1982). It removes spikes of up to three samples, but no steps, kinks
+    or longer pulses. A candidate is a spike if its distance from the median of its neighbors
+    (Hampel 1974) exceeds three times the range of the closest half of them, six standard deviations
+    of the noise, and six of the smallest steps of the signal, and if few other candidates are
+    nearby. (Many are nearby if a signal rings.)
 
     **Arguments:** `values`: the signal; NaN where a sample is missing.
     """
@@ -206,10 +213,11 @@ def _ranges_nearby(
 
 
 def noise_of(x: Series) -> float:
-    """Return the standard deviation of what changes from sample to sample, without few spikes.
+    """Return the standard deviation of the noise from sample to sample; a few spikes have no
+    effect.
 
-    It follows from the median of fourth differences, in which noise of standard deviation 1 has the
-    standard deviation sqrt(70), and slower changes next to none.
+    It follows from the median of fourth differences, which have the standard deviation sqrt(70) for
+    noise of standard deviation 1, and are nearly zero for slower changes.
     """
     median_of_normal = 0.6745  # of the modulus of a standard normal variable
     differences = np.abs(np.diff(x, n=4))
@@ -221,7 +229,8 @@ def recurring(
     phase: Float[np.ndarray, " k"],
     cycles: int | float,
 ) -> Bool[np.ndarray, " k"]:
-    """Return which spikes are transients of the motion: similar ones at this phase of most cycles.
+    """Return which spikes belong to the motion: similar spikes occur at the same phase of most
+    cycles.
 
     **Arguments:** `phase` of each, in cycles, which increases from stretch to stretch. `cycles`:
     number of cycles.
@@ -239,8 +248,8 @@ def recurring(
 
 
 def input_spikes(values: Series) -> Series:
-    """Return `spike_heights` of an input, only where it is smooth otherwise and a spike lies far
-    beyond its usual range: the perturbation itself must stay."""
+    """Return `spike_heights` of an input, but only if the input is smooth otherwise, and only of
+    spikes far beyond its usual range. (The perturbation itself must not be removed.)"""
     heights = spike_heights(values)
     if not heights.any():
         return heights

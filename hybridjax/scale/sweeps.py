@@ -44,11 +44,11 @@ _PIECES = 64
 # more is lost with a worker. Fewer: many small files.
 _SMALLEST = 4000
 _MEASURED = 250
-# Cycles of the coarse pass. Fewer: worse first guesses in each piece. More: it takes longer than
-# they save.
+# Number of cycles in the coarse pass, which computes first guesses for the pieces. Fewer: worse
+# guesses. More: the pass takes longer than its guesses save.
 _COARSE = 250
-# Digits of the guess, relative to the sizes of the states. More: results depend on how it was
-# found. Fewer: the coarse pass takes one more step.
+# A guess is rounded to this many digits, relative to the sizes of the states. More: results depend
+# in the last digits on how the guess was found. Fewer: Newton's method takes one more step.
 _DIGITS = 7
 
 

@@ -1,6 +1,9 @@
-"""The flow along a cycle to one section after the other, from a recorded turn on the host.
+"""The flow along a cycle to one section after the other, from recorded steps, on the host.
 
-The moves of the turn are cut where a section lies within them, without another search.
+`locate.py` calls `flow_along`. The *moves* of the cycle (its recorded steps, with the events at
+their ends) are cut where a section lies within them, without another search. If a section is found
+in the wrong place, look at `_levels_met` (in which move it lies) and `_until_settled` (where in the
+move).
 """
 
 import dataclasses
@@ -29,9 +32,12 @@ def flow_along(
     carry: tuple[Lanes, Any, Any],
     targets: Target,
 ) -> tuple[tuple[Lanes, Any, Any], Any] | None:
-    """The flow along a cycle from a lane on it to one of the `targets` after the other, all at
-    known times or all at states: what `through` returns. None if a target is not reached once in a
-    turn, and for implicit methods, whose steps have errors that decay before the turn ends."""
+    """The flow along a cycle, from a lane on it to the `targets` one after the other, in the form
+    that `through` returns. The targets are all at known times, or all depend on the state.
+
+    None if a target is not reached exactly once in a period. None for implicit methods, too: their
+    steps have errors that decay only until the end of the period.
+    """
     s = map.structure
     begin = carry[0]
     if has_implicit(s):
@@ -96,9 +102,9 @@ def flow_along(
 def _three_turns(
     map: ReturnMap, turn: tuple[Lanes, Tape]
 ) -> tuple[Moves, Float[np.ndarray, "d M"]]:
-    """The moves of a turn three times, one turn after the other, and the states before the events
-    of one. (Targets lie in the first two turns, and what follows them at most at the beginning of a
-    third.)"""
+    """The moves of one period, repeated three times, and the states before the events of one
+    period. (Targets lie in the first two periods, and the moves after them at most at the beginning
+    of a third.)"""
     starts, tape = turn
     is_move = tape.code.T != IDLE
     before = tape.before.transpose(2, 0, 1)[is_move].T
@@ -111,19 +117,19 @@ def _three_turns(
 
 
 class _Places(NamedTuple):
-    """Where K targets lie on the recorded moves."""
+    """The places of K targets on the recorded moves."""
 
     first: Int[np.ndarray, "1"]
     """Number of the move in which the flow begins."""
     key: Int[np.ndarray, " K"]
-    """Numbers of the moves that start at the targets, or in which these lie."""
+    """For each target, the number of the move that starts at it or contains it."""
     t: Float[np.ndarray, " K"]
     q: Float[np.ndarray, "d K"]
 
 
 class _Walk(NamedTuple):
-    """Starts of moves: at the beginning, where recorded moves start, and at targets, which take the
-    place of a recorded start at the same time."""
+    """Starts of the moves of the flow: its beginning, the starts of recorded moves, and the
+    targets. (If a recorded move starts at a target, only the target counts.)"""
 
     key: Int[np.ndarray, " W"]
     """Numbers of the recorded moves."""
@@ -186,8 +192,8 @@ def _ends_at_targets(
 def _places_on(
     map: ReturnMap, moves: Moves, ends: Any, begin: Lanes, targets: Target
 ) -> _Places | None:
-    """Where the targets, which follow each other, lie on moves whose `ends` are those of one turn;
-    None if one is not met once."""
+    """The places of the targets, in their order, on the moves of one period, which end at `ends`.
+    None if a target is not met exactly once."""
     s = map.structure
     period = map.expected
     late = TOGETHER * period
@@ -234,8 +240,8 @@ def _places_on(
 
 
 def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths):
-    """The move of one turn in which each target lies, and the time from its start, to first order;
-    None if one is not met once."""
+    """For each target, the move in which it lies, and the time from the start of the move to the
+    target, to first order. None if a target is not met exactly once."""
     K = len(targets.time)
     start, end = _levels_on(s, once, ends, targets)
     falls = (start > 0) & (end <= 0)
@@ -262,8 +268,8 @@ def _until_settled(
     by_clock: bool,
     period: float,
 ) -> Float[np.ndarray, "C n"] | None:
-    """(t, q) at the targets within moves, by Newton's method for levels, which changes the lengths
-    `h` of the moves until there; None if it does not converge."""
+    """(t, q) at the targets. Newton's method on the levels changes the time `h` from the start of
+    each move to its target. None if it does not converge."""
     start = Moves(*(x[..., move[inside]] for x in moves))
     arrival = ARRIVE_TIME if by_clock else ARRIVE_LEVEL
     start = start._replace(code=np.full(len(inside), arrival), lane=inside)
@@ -285,8 +291,9 @@ def _until_settled(
 def _levels_on(
     s: Structure, once: Moves, ends: Float[np.ndarray, "d M"], targets: Target
 ) -> Float[np.ndarray, "2 K M"]:
-    """Levels of targets at the starts and the ends of moves; the same where a move follows another
-    without an event, so that each crossing lies in one of them."""
+    """Levels of targets at the starts and the ends of moves. If no event lies between two moves,
+    the end of one and the start of the next have the same number, so that each crossing lies in
+    exactly one move."""
     index = np.broadcast_to(targets.index, targets.time.shape)
     point = (
         np.tile(once.t, 2),
@@ -309,8 +316,8 @@ def levels_at(
     chart: Int[np.ndarray, " K"],
     q: Float[np.ndarray, "d K"],
 ) -> Float[np.ndarray, "2 N K"]:
-    """The levels of N sections at K points of a cycle, and their rates; NaN in charts that have
-    none."""
+    """The levels of N sections at K points of a cycle, and their rates; NaN in charts without
+    levels."""
     out = np.full((2, N, len(t)), np.nan)
     for a in np.unique(chart).tolist():
         if levels is not None and levels.present(s, a):

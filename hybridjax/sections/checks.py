@@ -1,4 +1,10 @@
-"""Checks of sections that were located on a limit cycle."""
+"""Checks of sections that were located on a limit cycle.
+
+`locate.py` calls `check_placed`, which raises a `ComputationError` for the first section that the
+cycle misses, touches, crosses twice or meets in another order. The text of the error has the values
+at which the section would be crossed once (`_remedy`). A *level* is a function that falls through
+zero at its section.
+"""
 
 from typing import NamedTuple
 
@@ -26,13 +32,13 @@ from .along import levels_at
 from .placed import PlacedSections, followed_at_once
 
 
-# Parts of every step of the flow in which further crossings of a section are sought. Fewer: two
+# Number of parts of each step in which further crossings of a section are looked for. Fewer: two
 # crossings that are close are missed. More: the check takes longer.
 _PARTS_OF_A_STEP = 16
 
 
-# A section is tangent to the cycle if its level changes there at less than this fraction of its
-# fastest rate on the cycle. Smaller: crossings that are lost by a perturbation are accepted.
+# A section is tangent to the cycle if the rate of its level at the crossing is below this part of
+# its largest rate on the cycle. Smaller: crossings that a small perturbation removes are accepted.
 # Larger: sections at a small angle are rejected.
 _LEAST_STEEPNESS = 1e-4
 
@@ -41,8 +47,8 @@ _AGAIN = "is crossed more than once in one period"
 
 
 class OutOfOrderError(ComputationError):
-    """Sections that the cycle meets in another order than they are given in. `phases` (N,): the
-    time from section 0 to each, within one period."""
+    """Raised for sections that the cycle meets in another order than the given one. `phases` (N,):
+    time from section 0 to each section, within one period."""
 
     def __init__(self, text: str, phases: Float[np.ndarray, " N"]):
         super().__init__(text)
@@ -68,7 +74,8 @@ def check_placed(placed: PlacedSections, first: int) -> None:
     _require_order(placed)
     assert placed.tape is not None
     events = np.sum(np.asarray(placed.tape.code) >= 0)
-    # (By rounding, a round may hold the event at which it begins and ends twice, or not at all.)
+    # (If a section is an event, rounding decides whether this event counts twice or not at all in
+    # one period.)
     if events != len(placed.cycle.event_sequence):
         raise ComputationError(
             "a section coincides with an event (move it, or use `AtEvent`), or there were too few "
@@ -115,7 +122,7 @@ def _require_reached(placed: PlacedSections, results: list[int]) -> None:
 
 
 def _about_next_event(placed: PlacedSections, i: int) -> str:
-    """The reason for which section i, at an event that another one follows at once, is refused."""
+    """A sentence for the error: section i lies at an event that another event follows at once."""
     cycle = to_host(placed.cycle)
     s = cycle.structure
     lanes, event = to_host((placed.lanes, placed.bound.event))
@@ -198,8 +205,8 @@ def _met(placed: PlacedSections, i: int) -> _Met:
 
 
 def _remedy(placed: PlacedSections, i: int) -> str:
-    """Where the cycle crosses section i, the values through which the function of a `Crossing`
-    goes in its direction, and what to change."""
+    """Sentences for the error: where the cycle crosses section i, which values the function of a
+    `Crossing` takes in the crossing's direction, and what to change."""
     section, high, low, places = _met(placed, i)
     hint = f", at {' and '.join(places)}" if places else ""
     if section is None:
@@ -253,8 +260,8 @@ def _crossings(placed: PlacedSections) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _levels_along(placed: PlacedSections, levels: AbstractLevels):
-    """The number of crossings of each section (N,) by the cycle's steps, besides its own, the
-    fastest rate of its level (N,), and the rate on the section (N,)."""
+    """For each section: the number of further crossings by the steps of the cycle, the largest rate
+    of its level, and the rate of its level on the section."""
     s = placed.structure()
     N = placed.n_sections
     lanes = placed.lanes
@@ -267,7 +274,7 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
     crosses = above & at_or_below
     falls = crosses & (moves.h > 0)
 
-    # Around the section itself, rounding decides the signs.
+    # At the section itself, signs are rounding errors.
     begins_at = np.where(moves.order == 0, moves.lane, -1)
     is_itself = np.arange(N)[:, None] == begins_at
     falls[:, 0] &= ~is_itself
@@ -284,8 +291,8 @@ def _levels_along(placed: PlacedSections, levels: AbstractLevels):
 
 
 def _along_steps(s: Structure, moves: Moves, tape: Tape):
-    """Times, charts and states at several points of every step, by its cubic interpolant: first the
-    beginnings of all steps."""
+    """Times, charts and states at several points of every step, by its cubic interpolant. The first
+    point of each step is its beginning."""
     still = np.zeros((s.nu, 1))
     is_move = tape.code.T != IDLE
     end = tape.before.transpose(2, 0, 1)[is_move].T

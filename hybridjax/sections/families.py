@@ -1,4 +1,10 @@
-"""Families of sections: their interface, and those at equal times, arc lengths or angles."""
+"""Families of Poincaré sections: the interface (`AbstractSections`), and sections at equal times,
+arc lengths or angles, or given one by one.
+
+A family is a definition and belongs to no cycle. `place_sections` (`place.py`) calls its method
+`bind` with points of a limit cycle (`Orbit`), and gets `BoundSections`: where each section ends a
+piece of flow. A new kind of family is added here, as a subclass.
+"""
 
 import abc
 from collections.abc import Callable, Iterable, Sequence
@@ -38,9 +44,9 @@ class BoundSections(eqx.Module):
     the zero of a level function, or at an event."""
 
     time: Float[Array, " N"]
-    """Times of clock sections in one period; infinity for the others."""
+    """Times of clock sections in one period; infinity for other sections."""
     event: Int[Array, " N"]
-    """Indices of the transitions of event sections; -1 for the others."""
+    """Indices of the transitions of event sections; -1 for other sections."""
     levels: AbstractLevels | None = None
     """The level functions of all other sections, if there are any."""
 
@@ -118,14 +124,18 @@ class _Anchored(AbstractSections):
             self.anchor.check(s)
 
     def _first(self, at_crossing: Array, unit: Array | float = 1.0) -> Array:
-        """The phase of section 0: that of the orbit's first point at a crossing, or the anchor
-        itself, in some unit."""
+        """The phase of section 0. If the anchor is a crossing, it is `at_crossing`, the phase of
+        the orbit's first point; otherwise it is the anchor, times `unit`."""
         return at_crossing if isinstance(self.anchor, Crossing) else self.anchor * unit
 
     def describe(self, i: int) -> str:
+        return self._describe(i, self.label)
+
+    def _describe(self, i: int, kind: str) -> str:
+        """The name of section i, with its distance from section 0 in a kind of phase."""
         if i == 0:
             return "section 0"
-        return f"section {i} ({self.label} phase {i}/{self.n_sections} after section 0)"
+        return f"section {i} ({kind} phase {i}/{self.n_sections} after section 0)"
 
 
 def _as_anchor(x: Crossing | Scalar) -> Crossing | Array:
@@ -165,9 +175,7 @@ class ClockPhase(_Anchored):
         return BoundSections.at_times(first + steps)
 
     def describe(self, i: int) -> str:
-        if i == 0:
-            return "section 0"
-        return f"section {i} (clock phase {i}/{self.n_sections} after section 0)"
+        return self._describe(i, "clock")
 
 
 @checked
@@ -335,7 +343,8 @@ def _along(s: Structure, function: Callable, t, chart, q) -> tuple[Array, Array]
 class _AngleLevels(AbstractLevels):
     phase: KinematicPhase
     across: Float[Array, "2 N"]
-    """Factors of (r_p, r_v) in the level: it falls in the sense in which the cycle turns."""
+    """Factors of (r_p, r_v) in the level, with signs such that the level falls in the direction in
+    which the cycle goes round."""
 
     def _signals(self, s: Structure) -> Outputs:
         return s.resolve_outputs((self.phase.position, self.phase.velocity))
@@ -408,7 +417,8 @@ FamilyLike: TypeAlias = (
 
 
 def as_family(sections: FamilyLike) -> AbstractSections:
-    """A family from a family, a single section, a number of them, or a list of sections."""
+    """Return a family for any of the forms of `FamilyLike`: a family, a single section, a number of
+    clock sections, or a list of sections."""
     if isinstance(sections, int):
         return ClockPhase(sections)
     if isinstance(sections, Crossing | AtEvent):

@@ -1,4 +1,12 @@
-"""From a limit cycle and sections to the linear periodic system between them (paper Sec. III)."""
+"""`linearize`: from a limit cycle and sections to the linear periodic system between the sections
+(paper Sec. III).
+
+It returns an `LDTP` with matrices A, B, C, D at each section. `_matrices` computes them from the
+Jacobians of the flow from section to section (`PlacedSections.between`) and from derivatives of the
+outputs (`_output_jacobians`). There are three ways, which must agree: on the host; in a program of
+JAX, along the recorded itinerary of a known cycle (`_on_walk`, see `walk.py`); and in a program, by
+a search (`_searched`). Delays of inputs and outputs are in `Delayed`.
+"""
 
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -182,14 +190,16 @@ def _on_walk(
     outputs: tuple[str | Output, ...],
     walk: Walk,
 ):
-    """`_matrices` beside a known cycle; and the codes of the sections."""
+    """`_matrices` along the recorded itinerary of a known cycle near this one; and the result codes
+    of the sections."""
     placed, jacobians = walked(cycle, family, walk)
     matrices = placed.between(jacobians)
     return *matrices, *_output_jacobians(placed, outputs), placed.dims, placed.result
 
 
 def _on_walk_along(arguments: tuple, directions: tuple) -> tuple[tuple, tuple]:
-    """`_on_walk` and its derivatives; those of the host where sections leave the walk."""
+    """`_on_walk` and its derivatives. If sections leave the recorded itinerary, those of
+    `_matrices` on the host."""
     found, columns = along_program(_on_walk)(arguments, directions)
     codes = found[-1]
     if np.any(codes):
@@ -205,7 +215,8 @@ def _searched(
     outputs: tuple[str | Output, ...],
     _: Walk,
 ):
-    """`_on_walk` by a search, where a code that is hidden could not lead to one."""
+    """`_on_walk` by a search instead, where JAX hides the result codes, so that the search cannot
+    be chosen later."""
     matrices = _matrices(cycle, family, outputs, None)
     return *matrices, jnp.zeros(family.n_sections, jnp.int32)
 
@@ -235,15 +246,15 @@ def _output_jacobians(
 
 
 class _Departures(AbstractSections):
-    """The times at which the outputs of a `ClockPhase` leave the system; with two `parts`, each is
-    followed by the time at which the next input begins to act."""
+    """Sections at the times at which the outputs of a `ClockPhase` leave the system. With two
+    `parts`, each is followed by a section at the time at which the next input begins to act."""
 
     label: ClassVar[str] = "isochron"
     at_anchor: ClassVar[bool] = False
     phase: ClockPhase
     delay: Float[Array, "2"]
     lag: Array
-    """Whole sections in the sum of both delays."""
+    """Number of whole sections in the sum of both delays."""
     parts: int = eqx.field(static=True)
 
     n_sections = property(lambda self: self.parts * self.phase.n_sections)  # type: ignore[assignment]
@@ -267,8 +278,9 @@ class _Departures(AbstractSections):
 
 
 class Delayed(NamedTuple):
-    """A system with delays: its response at section n to the inputs `lag` sections earlier and,
-    unless these act right then, to those before them as more inputs."""
+    """A linear system with delays. Its inputs at section n are those of `lag` sections earlier.
+    Unless inputs begin to act exactly at a section, the inputs of one more section earlier are
+    further inputs."""
 
     model: LDTP
     lag: Array
@@ -292,7 +304,7 @@ class Delayed(NamedTuple):
         delay = jnp.asarray(delay, float)
         whole = delay.sum() * phase.n_sections / cycle.period
         lag = stop_gradient(jnp.floor(whole + TOGETHER))
-        # (Sections that coincide are refused.)
+        # (Two sections at the same time would be refused.)
         together = False
         if not is_traced(cycle, delay):
             together = bool(whole - lag < 2 * TOGETHER)

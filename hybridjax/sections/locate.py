@@ -1,4 +1,11 @@
-"""The position of the sections of a family on a limit cycle."""
+"""Locate the sections of a family on a limit cycle.
+
+`place.py` calls `place_in_order` or `place_on_host` (outside of programs of JAX) or
+`place_in_program` (inside), and gets `PlacedSections`. `_place` does the work: it binds the family
+to the cycle (`_bind`), flows to section 0, and then from each section to the next. On the host, the
+recorded steps of the cycle are used if they are known (`along.py`); otherwise there is a search.
+Results are checked in `checks.py`.
+"""
 
 import dataclasses
 from typing import Any
@@ -37,9 +44,9 @@ from .families import AbstractSections, BoundSections, Orbit, SectionList
 from .placed import PlacedSections, followed_at_once
 
 
-# The last sections that were placed: `linearize`, then `run_experiments`, ask for the same ones.
+# The sections that were placed last, since `linearize` and `run_experiments` ask for the same ones.
 _recent = Recent(4)
-# The same, by lists that were not in order.
+# The same for lists that were not in order.
 _sorted = Recent(4)
 
 
@@ -52,7 +59,7 @@ def _patient(cycle: LimitCycle) -> ReturnMap:
 
 
 def place_on_host(cycle: LimitCycle, family: AbstractSections) -> PlacedSections:
-    """The sections of a family on a cycle that is no tracer.
+    """The sections of a family on a cycle that JAX does not trace.
 
     **Raises:** as `place_sections`.
     """
@@ -60,7 +67,8 @@ def place_on_host(cycle: LimitCycle, family: AbstractSections) -> PlacedSections
     if placed is not None:
         return placed
     family.check(cycle.structure)
-    # (Programs of `_place` are for one number of moves: none are given where they do not help.)
+    # (Compiled functions depend on the number of moves: for implicit methods, whose moves are not
+    # used, none are given.)
     turn = None if has_implicit(cycle.structure) else last_turn(cycle)
     first, fields = _place(_patient(cycle), family, turn)
     placed = PlacedSections(cycle, family, *fields)
@@ -69,8 +77,8 @@ def place_on_host(cycle: LimitCycle, family: AbstractSections) -> PlacedSections
 
 
 def place_in_order(cycle: LimitCycle, family: AbstractSections) -> PlacedSections:
-    """The sections of a family on a cycle that is no tracer, those of a list in the order in which
-    the cycle meets them.
+    """The sections of a family on a cycle whose values are known (JAX traces none). Sections of a
+    list are in the order in which the cycle meets them.
 
     **Raises:** as `place_sections`.
     """
@@ -88,7 +96,7 @@ def place_in_order(cycle: LimitCycle, family: AbstractSections) -> PlacedSection
 
 
 def place_in_program(cycle: LimitCycle, family: AbstractSections) -> PlacedSections:
-    """The sections of a family on a traced cycle, with the code of each for a failure."""
+    """The sections of a family on a traced cycle, with a result code for each section."""
     _, fields = _place(_patient(cycle), family, None)
     return PlacedSections(cycle, family, *fields)
 
@@ -96,8 +104,8 @@ def place_in_program(cycle: LimitCycle, family: AbstractSections) -> PlacedSecti
 def place_by_turn(
     cycle: LimitCycle, family: AbstractSections, turn: Any
 ) -> tuple[PlacedSections, list]:
-    """The sections of a family on a cycle by its last turn, on the host, and the start, target and
-    tape of every flow."""
+    """The sections of a family on a cycle, from its recorded steps, on the host; and the start,
+    target and tape of the flow to each section."""
     flows: list[Any] = []
     _, fields = _locate(_patient(cycle), family, turn, flows)
     return PlacedSections(cycle, family, *fields), flows
@@ -115,7 +123,8 @@ def _place(
 def _locate(
     map: ReturnMap, family: AbstractSections, turn: Any, flows: list
 ) -> tuple[Any, Any]:
-    """Do as `_place`; on the host `flows` gets the start, target and tape of every flow."""
+    """As `_place`. On the host, the start, target and tape of every flow are appended to
+    `flows`."""
     s = Structure(map.system)
     N = family.n_sections
     period = map.expected
@@ -153,7 +162,8 @@ def _locate(
     duration = moved.lanes.t - lanes.t
     near = _near_events(map, bound, lanes, moved.lanes, tape)
     result = update_result(moved.result, near, Result.SIMULTANEOUS)
-    # (An event that is missed on a section is the cause of a failure on the way from there.)
+    # (If an event on a section was missed, it is the cause of a failure of the flow that starts
+    # there.)
     still = xp.zeros((s.nu, 1))
     missed = followed_at_once(s, lanes, still, bound.event >= 0, period)
     result = xp.where(missed >= 0, xp.int32(Result.EVENT_ORDER), result)
@@ -165,7 +175,7 @@ def _locate(
 
 
 def _all_sections(bound: BoundSections, period: Any, begins_on_section: bool) -> Target:
-    """The targets on one section after the other, until section 0 is met again."""
+    """The targets of a flow from section to section, until section 0 is met again."""
     N = len(bound.time)
     xp = namespace(bound.time)
     k = xp.arange(int(begins_on_section), N + 1)
@@ -184,8 +194,8 @@ def _all_sections(bound: BoundSections, period: Any, begins_on_section: bool) ->
 def _near_events(
     map: ReturnMap, bound: BoundSections, starts: Lanes, ends: Lanes, tape: Any
 ) -> Array:
-    """Test at which of N clock sections an event happens, but for those of the clock: rounding
-    would decide on which side of it they lie."""
+    """Test at which of N clock sections an event of a guard happens: rounding would decide on which
+    side of the event such a section lies."""
     xp = namespace(bound.time)
     s = map.structure
     is_scheduled = [isinstance(x.guard, Scheduled) for x in s.transitions]
@@ -220,8 +230,8 @@ def coordinates_on(
 
 
 def recorded_flows(placed: PlacedSections) -> tuple[Any, Any]:
-    """Starts and steps, side by side, of the flow from a cycle's beginning to the anchor of the
-    family (None if that is no `Crossing`), and from there to one section after the other."""
+    """Starts and recorded steps of two flows: from the cycle's beginning to the anchor of the
+    family (None if the anchor is no `Crossing`), and from there to one section after the other."""
     cycle = placed.cycle
     flows: list[Any] = []
     turn = None if has_implicit(cycle.structure) else last_turn(cycle)
@@ -235,7 +245,8 @@ def recorded_flows(placed: PlacedSections) -> tuple[Any, Any]:
 def _bind(
     s: Structure, map: ReturnMap, family: AbstractSections, anchor: Lanes, go
 ) -> BoundSections:
-    """The family evaluated on the cycle; clock sections in the period that begins at the anchor."""
+    """The family bound to the cycle. Times of clock sections lie in the period that begins at the
+    anchor."""
     period = map.expected
     t = anchor.t[0]
     M = family.points
@@ -255,7 +266,7 @@ def _bind(
 
 
 def bind_at(map: ReturnMap, family: AbstractSections, points: Lanes) -> BoundSections:
-    """The family evaluated on the cycle, from points at equal times."""
+    """The family bound to the cycle, from points at equal times."""
     orbit = Orbit(
         period=map.expected,
         t=points.t,

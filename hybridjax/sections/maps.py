@@ -1,4 +1,9 @@
-"""The maps P_{i->j} between Poincaré sections (paper eq. 3)."""
+"""The maps P_{i->j} between Poincaré sections, for any state near the cycle (paper eq. 3).
+
+`section_map` returns a `SectionMap`, which users call with a state on section i. It flows to
+section j (`_arrivals`) and returns an `Arrival`. `plot/returns.py` calls `arrivals` for many states
+at once.
+"""
 
 import dataclasses
 from typing import Annotated, NamedTuple
@@ -26,14 +31,14 @@ from .place import as_placed
 from .placed import PlacedSections, SectionsLike, followed_at_once
 
 
-# Periods after which a state is given up that has not reached the section. Fewer: states far from
-# the cycle do not arrive. More: those that never arrive cost more.
+# Number of periods after which a state is given up if it has not reached the section. Fewer: states
+# far from the cycle do not arrive. More: states that never arrive take longer.
 _PATIENCE = 100
 
 
 class Arrival(NamedTuple):
     """The time and the state at which a trajectory arrives on the second section of a section map.
-    If it does not arrive, these and their derivatives are NaN."""
+    If it does not arrive, time, state and their derivatives are NaN."""
 
     t: Float[Array, ""]
     """Time of arrival; the cycle itself arrives at `placed.lanes.t[j]`, plus a period if j <= i."""

@@ -1,4 +1,10 @@
-"""Sections of a family placed on a limit cycle, and their derivatives."""
+"""`place_sections`: the sections of a family on a limit cycle, with derivatives.
+
+It returns `PlacedSections`. The sections are located in `locate.py`; inside of programs of JAX,
+they are located along the recorded itinerary of a known cycle if there is one (`walk.py`).
+`place_along` computes derivatives of placed sections on the host, for `linearize`. `observed_at`
+gives only the times of sections and the outputs, for fits.
+"""
 
 import dataclasses
 from typing import Any, cast
@@ -78,9 +84,10 @@ def place_sections(cycle: LimitCycle, sections: FamilyLike) -> PlacedSections:
 
 
 def as_placed(cycle: LimitCycle, sections: SectionsLike) -> PlacedSections:
-    """`sections` placed on `cycle`: a family is placed, sections that were placed on it are kept.
+    """Place `sections` on `cycle`. Sections that were already placed on it are returned as they
+    are.
 
-    **Raises:** `DefinitionError` for sections that were placed on another one; otherwise as
+    **Raises:** `DefinitionError` for sections that were placed on another cycle; otherwise as
     `place_sections`.
     """
     if not isinstance(sections, PlacedSections):
@@ -107,8 +114,9 @@ def place_along(
     by_cycle: LimitCycle,
     by_family: AbstractSections,
 ) -> tuple[PlacedSections, kernels.Tangents, np.ndarray]:
-    """Sections placed on the host in P directions, as complex numbers of N P sections (see
-    `kernels.Tangents`), the structure, and the Jacobians (N, P, n, m) of the flow."""
+    """Derivatives of placed sections in P directions, on the host. Returns N P sections as complex
+    numbers, whose imaginary parts are derivatives (see `kernels.Tangents`); the structure; and the
+    Jacobians (N, P, n, m) of the flow from section to section."""
     placed, flows = place_by_turn(cycle, family, turn)
     N = family.n_sections
     if np.any(placed.result):
@@ -130,7 +138,7 @@ def place_along(
         no_times = np.zeros((P, 1))
         _, tangents, _ = follow(flows.pop(0), levels, no_times)
         x = tangents[-1]
-    # The points of the orbit on which the family depends.
+    # The points of the orbit that the family needs.
     M = family.points
     points = side_by_side(flows[0][0])
     moved_points = x[None]
@@ -180,11 +188,12 @@ def _moved_times(
     late: float,
     ends: Int[np.ndarray, " k"],
 ) -> Float[np.ndarray, "P k"]:
-    """Tangents of the times of sections in P directions; zero for sections of the state.
+    """Derivatives of the times of sections in P directions; zero for sections that depend on the
+    state.
 
-    **Arguments:** `by_time`: tangents of the times in the first period. `longer`: tangents of the
-    period. `late`: periods by which all sections are later. `ends`: the sections, of which section
-    N is section 0 one period later.
+    **Arguments:** `by_time`: derivatives of the times within the first period. `longer`:
+    derivatives of the period. `late`: number of periods by which all sections are later. `ends`:
+    the sections; section N is section 0 one period later.
     """
     N = len(is_clock)
     section = ends % N

@@ -1,4 +1,11 @@
-"""A section family that was placed on a limit cycle."""
+"""`PlacedSections`: the sections of a family on a limit cycle, as `place_sections` returns them.
+
+They have the time, chart and state of the cycle at each section, and the coordinates on it.
+`linearize` asks for the Jacobians from section to section (`flow_jacobians`, `between`),
+experiments for the targets of the flow (`onwards`) and for outputs (`observe`). `frames` relates
+coordinates on a section to deviations of time and state: if matrices of `linearize` are wrong and
+the flow is right, look there.
+"""
 
 from typing import TypeAlias
 
@@ -158,8 +165,8 @@ class PlacedSections(Showable, eqx.Module):
         """Matrices from the coordinates on each section to deviations of (t, q), and back.
 
         Coordinate j is entry k(j) of (t, q), skipping t on clock sections and on autonomous
-        systems, and skipping `drop`. A move in coordinate j takes the dropped entry along the
-        section: -normal_k / normal_drop.
+        systems, and skipping `drop`. If coordinate j changes by 1, the dropped entry changes by
+        -normal_k / normal_drop, so that the point stays on the section.
         """
         normal = self.normal
         drop = self.drop[:, None]
@@ -170,7 +177,8 @@ class PlacedSections(Showable, eqx.Module):
 
         kept = (k != drop) & ((k > 0) | self.time_is_state[:, None])
         kept_first = xp.argsort(~kept, axis=1, stable=True)
-        # One column more than a chart has states is never needed: (t, q) less the dropped entry.
+        # A section has at most as many coordinates as its chart has states: (t, q) less the dropped
+        # entry.
         exists = k < self.dims[:, None]
         select = xp.where(exists[:, :, None], unit[kept_first], 0.0)
 
@@ -199,8 +207,8 @@ class PlacedSections(Showable, eqx.Module):
     def between(
         self, jacobian: Float[Array, "N n m"]
     ) -> tuple[Float[Array, "N c c"], Float[Array, "N c nu"]]:
-        """A and B, padded, from derivatives of (t, q) on each next section by (t, q) and the inputs
-        on this one; NaN where the flow failed."""
+        """A and B, padded, from the derivatives of (t, q) on the next section by (t, q) and the
+        inputs on each section; NaN where the flow failed."""
         xp = namespace(jacobian)
         n = self.normal.shape[1]
         failed = self.result != Result.OK
@@ -213,8 +221,9 @@ class PlacedSections(Showable, eqx.Module):
 
     @property
     def across(self) -> Float[Array, "A d"] | None:
-        """Sizes of the states, on the host, of an autonomous system between sections that depend on
-        the state only: the direction of its flow must not drown strong contraction."""
+        """Magnitudes of the states, if deviations along the flow have no meaning: in an autonomous
+        system with state-based sections. They are then projected out, so that they do not drown
+        strong contraction (see `chain` in `engine/replay.py`). Otherwise None. On the host only."""
         hidden = (
             is_hidden(self) or self.cycle.clocked or np.isfinite(self.bound.time).any()
         )
@@ -235,11 +244,12 @@ class PlacedSections(Showable, eqx.Module):
     def target(
         self, i: Int[Array, " #L"], t: Float[Array, " L"], turns: Int[Array, " #L"]
     ) -> Target:
-        """The target of lanes that flow to section i, `turns` periods after the first turn."""
+        """The target of lanes that flow to section i, `turns` periods after the first period."""
         return section_target(self.bound, self.lanes, self.cycle.period, i, t, turns)
 
     def onwards(self) -> tuple[Int[Array, " N"], Int[Array, " N"], Target]:
-        """The section after each, the turns until it, and the target on it."""
+        """For each section, the next section, the number of periods until it (0 or 1), and the
+        target of the flow to it."""
         following = (
             namespace(self.lanes.t).arange(self.n_sections) + 1
         ) % self.n_sections
@@ -255,8 +265,8 @@ def section_target(
     t: Float[Array, " L"],
     turns: Int[Array, " #L"],
 ) -> Target:
-    """The target of lanes that flow to section i, `turns` periods after the first turn. They may
-    arrive half a period after the cycle itself."""
+    """The target of lanes that flow to section i, `turns` periods after the first period. They may
+    arrive up to half a period later than the cycle."""
     xp = namespace(t)
     arrival = lanes.t[i] + turns * period
     time = xp.broadcast_to(bound.time[i] + turns * period, t.shape)
@@ -279,9 +289,8 @@ def followed_at_once(
     at_event: Bool[Array, " L"],
     period: Float[Array, ""],
 ) -> Int[Array, " L"]:
-    """The transitions (by index; -1: none) that happen at once where lanes are on sections that are
-    events (`at_event`), since these have led there. Flows that begin on the section would miss
-    them.
+    """The transitions (by index; -1: none) that happen at once after the event at which a section
+    lies (`at_event`). A flow that begins on the section would miss such an event.
 
     **Arguments:** `u`: the inputs until the events.
     """

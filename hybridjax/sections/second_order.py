@@ -1,4 +1,10 @@
-"""Second derivatives of the maps between sections, and of outputs there."""
+"""Second derivatives of the maps between sections, and of outputs at the sections.
+
+`hj.designs` calls `second_order` and asks the `Quadratic` for the nonlinear distortion of second
+order that inputs cause: `Quadratic.second_order` for given inputs, `products` for all pairs of
+cosines. A wrong distortion has its cause in `_derivatives`, which differentiates the flow from
+section to section twice, or in `_pairs`.
+"""
 
 from typing import NamedTuple
 
@@ -20,8 +26,8 @@ from .place import as_placed
 from .placed import PlacedSections, observe
 
 
-# Complex numbers in the largest array of responses to pairs of cosines. More: more memory. Fewer:
-# more passes.
+# Number of complex numbers in the largest array of responses to pairs of cosines. More: more
+# memory. Fewer: more loops.
 _NUMBERS = 2**21
 
 
@@ -31,7 +37,7 @@ class Quadratic(NamedTuple):
     step: Float[np.ndarray, "N n m"]
     """First derivatives of the states at the next section."""
     bend: Float[np.ndarray, "N n m m"]
-    """Their second derivatives."""
+    """Second derivatives of the states at the next section."""
     show: Float[np.ndarray, "N ny m"]
     """First derivatives of the outputs."""
     show_bend: Float[np.ndarray, "N ny m m"]
@@ -101,12 +107,12 @@ class Quadratic(NamedTuple):
         def ahead(x, section):
             return (A[section] @ x + forcing[section]) * back
 
-        # The state after a period that begins at zero.
+        # The state after one period from zero.
         x = np.zeros(forcing.shape[1:], complex)
         for section in range(len(A)):
             x = ahead(x, section)
 
-        # The start that returns to itself.
+        # The periodic start.
         turns = -2j * np.pi * f
         back_a_period = np.exp(turns)[:, None, None]
         returned = back_a_period * monodromy(A)
@@ -151,8 +157,8 @@ class Quadratic(NamedTuple):
         f: Float[np.ndarray, " K"],
         first: Int[np.ndarray, " k"],
     ) -> Complex[np.ndarray, "N ny k 2 second"]:
-        """Outputs at the sums and at the differences of frequencies, for pairs of the `first`
-        waves with these and all that follow."""
+        """Outputs at the sums and at the differences of frequencies, for pairs of a wave in `first`
+        with itself or a later wave."""
         N, n, _ = self.step.shape
         C = self.show[:, :, :n]
         ny = C.shape[1]
@@ -175,10 +181,11 @@ class Products(NamedTuple):
     """Responses of second order to pairs of cosines, $F''(w_k, w_l)$ in place of an input."""
 
     sum: Float[np.ndarray, "ny K K"]
-    """Mean squares over the sections, at the sum of their frequencies."""
+    """Mean squares over the sections of the response at the sum of the two frequencies."""
     difference: Float[np.ndarray, "ny K K"]
     mean: Float[np.ndarray, "ny N K"]
-    """The response to a cosine with itself, at the difference."""
+    """The response to the pair of a cosine with itself, at the difference of frequencies, which is
+    zero."""
 
     def gaussian(self) -> Float[np.ndarray, "ny K K"]:
         """G: the mean square of the part of second order is $p^T G p$, for random inputs with
@@ -186,7 +193,8 @@ class Products(NamedTuple):
         return (self.sum + self.difference) / 4 + self._shift()
 
     def cosines(self) -> Float[np.ndarray, "ny K K"]:
-        """The same for cosines with random phases: less, since each has a constant amplitude."""
+        """The matrix G for cosines with random phases. It is smaller than for random inputs, since
+        each cosine has a constant amplitude."""
         pairs = (self.sum + self.difference) / 4
         k = np.arange(pairs.shape[-1])
         pairs[:, k, k] = self.sum[:, k, k] / 8
@@ -205,8 +213,8 @@ def _bent(bend, w):
 
 
 def _pairs(bend, first, second) -> Complex[np.ndarray, "N rows some both"]:
-    """Second derivatives along pairs of waves (N, m, some), the second of which come twice: as
-    they are, and conjugate."""
+    """Second derivatives along pairs of waves (N, m, some). Each second wave is used twice: as it
+    is, and conjugate."""
     along = np.einsum("noij,nis->nosj", bend, first, optimize=True)
     N, rows, count, m = along.shape
     along = along.reshape(N, rows * count, m)
@@ -285,7 +293,7 @@ def _derivatives(placed: PlacedSections, items: tuple[str | Output, ...]):
         tangent = jnp.broadcast_to(second[:, None], x.shape)
         return jax.jvp(along(first), (x,), (tangent,))
 
-    # Second derivatives are symmetric: those of pairs with i <= j are all.
+    # Second derivatives are symmetric: only pairs with i <= j are computed.
     i, j = np.triu_indices(m)
     unit = jnp.eye(m)
     first, second = jax.vmap(twice)(unit[i], unit[j])

@@ -1,8 +1,11 @@
-"""Sections on a cycle beside one that is known, by its itinerary.
+"""Sections on a cycle near a known cycle, along the recorded itinerary of the known one.
 
-The trajectory from section to section of the known cycle is a table (`engine/itinerary`). Within a
-program of JAX, where nothing searches, a neighboring cycle follows it: one pass gives the times and
-states on the sections, and the derivatives of the flow from each to the next.
+The *itinerary* of the known cycle is the sequence of charts, steps and events from section to
+section, stored as a table (`engine/itinerary`); a `Walk` has it. Inside of a program of JAX, where
+nothing searches, a neighboring cycle follows it: one run gives times and states on the sections,
+and the derivatives of the flow from each section to the next. `place.py` and `linearization.py`
+call `walk_beside` (is there a walk?) and `walked`. Sections that leave the walk have a result code.
+A *leg* is a part between two events or sections.
 """
 
 import dataclasses
@@ -37,30 +40,32 @@ from .locate import bind_at, coordinates_on, place_on_host, recorded_flows
 from .placed import PlacedSections
 
 
-# Steps of a walk for each recorded one, which a system beside the known one may not suit. Fewer:
-# neighbors leave the walk. More: it takes longer. (Implicit steps differ much in length.)
+# Number of steps of a walk, relative to the recorded ones, which may be too long for a neighboring
+# system. Fewer: neighbors leave the walk. More: the walk takes longer. (The second number is for
+# implicit methods, whose steps differ much in length.)
 _DENSITY, _IMPLICIT_DENSITY = 2.0, 6.0
-# Passes of a walk: the first finds the ends of legs, with which the steps of the last one lie as on
-# the known cycle. Fewer: neighbors leave the walk. More: it takes longer.
+# Number of times the walk is run. The first run finds the ends of legs; in the last one, steps are
+# then placed as on the known cycle. Fewer: neighbors leave the walk. More: time.
 _PASSES = 2
 
 
 class Walk(eqx.Module):
-    """From a cycle's beginning to each of its N sections, and to the first one again."""
+    """The way from a cycle's beginning to each of its N sections, and to the first section
+    again."""
 
     lead: Plan | None
-    """To the anchor of the family, if that is a `Crossing`."""
+    """The way to the anchor of the family, if the anchor is a `Crossing`."""
     path: Plan
-    """From there."""
+    """The way from the anchor to all sections."""
     period: Float[Array, ""]
-    """Of the known cycle."""
+    """Period of the known cycle."""
     late: Float[Array, ""]
-    """Periods that the sections at times come later than the family says."""
+    """Number of periods by which clock sections come later than the family says."""
     chart_at_anchor: Int[Array, "1"]
     arrivals: Int[Array, " K"]
-    """Legs that end on sections: on all N, and on the first one again."""
+    """Numbers of the legs that end on sections: on all N sections, and on the first one again."""
     begins_on_section: bool = eqx.field(static=True)
-    """Whether the anchor is section 0: then it is no arrival."""
+    """Whether the anchor is section 0, on which no leg then ends."""
     forwards: bool = eqx.field(static=True)
     """Whether only forward mode differentiates the walk."""
     armed: Bool[Array, "G N"]
@@ -74,8 +79,8 @@ _recorded = Recent(8)
 
 
 def walk_of(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
-    """The walk of a known cycle; None where flags cannot tell if a neighbor keeps it, or where the
-    family needs more than one point of the cycle.
+    """The walk of a known cycle. None if flags cannot tell whether a neighbor follows it (see
+    `has_route`), or if the family needs more than one point of the cycle.
 
     **Raises:** as `place_sections`.
     """
@@ -130,7 +135,7 @@ def _walk(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
 
 
 def walk_beside(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
-    """The walk for a traced cycle that was found beside a known one; None if there is none."""
+    """The walk for a traced cycle that was found from a known cycle; None if there is none."""
     for other, walk in _walks.get(cycle, None) or []:
         if other is family:
             return walk
@@ -141,7 +146,7 @@ def walk_beside(cycle: LimitCycle, family: AbstractSections) -> Walk | None:
 
 
 def walk_with(cycle: LimitCycle, family: AbstractSections, walk: Walk | None) -> None:
-    """Have a traced cycle follow a walk to the sections of a family."""
+    """Remember that a traced cycle follows a walk to the sections of a family."""
     if walk is not None:
         noted: list[tuple] = _walks.recall(cycle, None, list)
         noted.append((family, walk))
@@ -150,8 +155,8 @@ def walk_with(cycle: LimitCycle, family: AbstractSections, walk: Walk | None) ->
 def walked(
     cycle: LimitCycle, family: AbstractSections, walk: Walk
 ) -> tuple[PlacedSections, Float[Array, "N n m"]]:
-    """The sections of a family on a cycle, and the derivatives of (t, q) on each next section by
-    (t, q) and the inputs on this one. The result of sections that leave the walk is a code."""
+    """The sections of a family on a cycle, and the derivatives of (t, q) on the next section by (t,
+    q) and the inputs on each section. Sections that leave the walk have a result code."""
     map = cycle.return_map
     traced = [x.size for x in jax.tree_util.tree_leaves((map, family)) if is_tracer(x)]
     few = sum(traced) <= JACOBIAN_COLUMNS
@@ -180,8 +185,8 @@ def walked(
 def _passed(
     walk: Walk, map: ReturnMap, family: AbstractSections, reverse: bool
 ) -> tuple[tuple, Passage, Int[Array, ""]]:
-    """The time and the state at the anchor, the passage from there to all sections, and the code of
-    both ways.
+    """The time and the state at the anchor, the passage from the anchor to all sections, and the
+    result code of both ways.
 
     **Arguments:** `reverse`: whether reverse mode differentiates every row of the walk.
     """
@@ -218,7 +223,7 @@ def _bound(
 
 
 def _known_ends(map: ReturnMap, walk: Walk, bound: BoundSections) -> Float[Array, " E"]:
-    """Ends of legs on sections at known times; infinite for others."""
+    """Times at which legs end on clock sections; infinity for other legs."""
     N = len(bound.time)
     k = np.arange(int(walk.begins_on_section), N + 1)
     times = bound.time[k % N] + (k // N) * map.expected
@@ -237,7 +242,7 @@ def _followed(
 ) -> Passage:
     """A trajectory of a system on a path of a walk.
 
-    **Arguments:** `known`: ends of legs where they are known, otherwise infinite.
+    **Arguments:** `known`: known times of the ends of legs; infinity for others.
     """
     maps = maps_of(map)
     travelers = Travelers(

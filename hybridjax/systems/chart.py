@@ -1,4 +1,8 @@
-"""A chart: one mode of a hybrid system, with its own states and its own vector field."""
+"""`Chart`: one mode of a hybrid system, with its own states and its own vector field.
+
+Users subclass `Chart`; `FieldChart` makes a chart from a function, and `DerivedChart` changes parts
+of another chart. The engine reads charts through `structure.py`.
+"""
 
 import abc
 import dataclasses
@@ -126,12 +130,13 @@ class FieldChart(Chart):
 
 
 def attribute_of(part: str, name: str) -> Any:
-    """A property that is an attribute of a part of the object."""
+    """A property that reads the attribute `name` of the object's attribute `part`."""
     return property(operator.attrgetter(f"{part}.{name}"))
 
 
 class DerivedChart(Chart):
-    """A chart made of another one, of which it has all that it does not define anew."""
+    """A chart made from another chart. Attributes that it does not define are those of the other
+    chart."""
 
     chart: Chart
     states = attribute_of("chart", "states")

@@ -1,4 +1,11 @@
-"""Checks of a system: names, shapes of every function, finite parameters."""
+"""Checks that a system is well formed: names, shapes of every function, finite parameters,
+schedules.
+
+`simulate`, searches and fits call `check_system` before they use a system, and `check_output` for
+outputs that users give. Each function of the user is traced once by JAX; `evaluating` turns errors
+of the user's code into a `DefinitionError` that says what to write. `_dependence` finds out from
+the traced program whether a function uses the time.
+"""
 
 import contextlib
 import functools as ft
@@ -29,8 +36,8 @@ from .system import HybridSystem, Output, arrays_of, name_of, require_positive
 from .transition import SAME_TIME, Scheduled, Transition
 
 
-# Systems that have passed, but for their numbers. (A `Memory` forgets with its object, and each
-# value of a parameter makes a new one.)
+# Classes of systems that have passed, without the values of parameters. (Not a `Memory`, which
+# forgets with its object: each value of a parameter makes a new object.)
 _passed: dict[Hashable, tuple[str, ...]] = {}
 
 
@@ -81,7 +88,8 @@ def _check_functions(s: Structure) -> Iterator[str]:
     for a in range(len(s.charts)):
         yield from _check_chart(s, a)
     _check_all_names(s)
-    # Transitions of one kind are one program; the first and the last may index beyond the states.
+    # (Transitions of one kind are one program, of which the first and the last member are tested:
+    # an index may be beyond the states.)
     ends = set()
     for kind in s.kinds:
         ends |= {kind[0], kind[-1]}
@@ -152,8 +160,8 @@ def _check_all_names(s: Structure) -> None:
 
 
 def check_schedules(s: Structure) -> None:
-    """**Raises:** `DefinitionError` for two schedules of one chart, or of a chart and of one that
-    the first leads to, that are due at the same time.
+    """**Raises:** `DefinitionError` for two schedules that are due at the same time, of one chart,
+    or of a chart and the chart to which the first schedule leads.
 
     Of schedules with the same period, the event that belongs to an earlier period comes first: at
     duty 1, `Scheduled(T, duty * T)` comes before `Scheduled(T)`. Transitions of one clock (see
@@ -178,8 +186,8 @@ def check_schedules(s: Structure) -> None:
 
 
 def _meet(first: Any, second: Any) -> bool:
-    """Test whether the events of two schedules, or if their periods are the same, those of one
-    period, have the same time."""
+    """Test whether events of two schedules have the same time. If the periods are equal, only
+    events of the same period are compared."""
     apart = float(first.offset) - float(second.offset)
     shorter, longer = sorted([float(first.period), float(second.period)])
     same = SAME_TIME * shorter
@@ -241,9 +249,9 @@ def _check_shape(
     reason: str,
     in_flow: bool = True,
 ) -> Iterator[str]:
-    """Check the shape of a function of a structure and (t, q, u) in chart a. `reason`: why it must
-    be this one. Check the precision of a function that takes part in the flow (`in_flow`). Yield
-    its name, `what`, if it uses t."""
+    """Check the shape of a function of a structure and (t, q, u) in chart a, and its precision if
+    it takes part in the flow (`in_flow`). Yield its name `what` if it uses t. `reason`: why it must
+    have this shape, for the error."""
     shapes = (), (s.dims[a],), (s.nu,)
     with evaluating(what, " (`t`, `q[0]` and `u[0]` are numbers, q and u are arrays)"):
         real = jnp.result_type(float)
@@ -292,14 +300,14 @@ def _rounded_to(program: Program, moving: Sequence[bool]) -> str:
 
 
 def _depends_on(program: Program, moving: Sequence[bool]) -> bool:
-    """Test whether a result of a program depends on arguments that are `moving`, but for products
-    with the number zero."""
+    """Test whether a result of a program depends on arguments that are `moving`. Products with a
+    constant zero do not count."""
     return any(_dependence(program, [(x, False) for x in moving]))
 
 
 def _dependence(program: Program, arguments: Sequence[tuple[bool, bool]]) -> list[bool]:
-    """Whether each result of a program depends on arguments, of which each is given by whether it
-    moves, and whether it is the number zero."""
+    """Whether each result of a program depends on its arguments. An argument is given by two flags:
+    whether it moves, and whether it is the number zero."""
     states = dict(zip(program.invars, arguments, strict=True))
 
     def state(x) -> tuple[bool, bool]:
@@ -344,7 +352,8 @@ def _check_indices(function: Callable, *point: np.ndarray) -> None:
 
 @contextlib.contextmanager
 def evaluating(what: str, takes: str = "") -> Iterator[None]:
-    """A context in which JAX traces a user's function, of which errors say what to write instead.
+    """A context in which JAX traces a user's function. Errors of the function become errors that
+    say what to write instead.
 
     **Raises:** `DefinitionError`.
     """
@@ -378,7 +387,8 @@ def _problem(error: Exception, takes: str) -> str:
         )
     if "not subscriptable" in text:
         return f"{text} (parameters are attributes: write `p.k` for `p['k']`)"
-    # (Sentences of this package lead on, and a name that is not there is none of the arguments.)
+    # (Errors of this package already say what to do, and a missing name has nothing to do with the
+    # arguments.)
     if isinstance(error, HybridJaxError | NameError | KeyError):
         return text
     return text + takes

@@ -1,4 +1,8 @@
-"""What a system looks like in one state, for animations: shapes by name, without matplotlib."""
+"""`Drawing`: what a system looks like in one state, for animations. It has shapes by name, without
+matplotlib.
+
+`HybridSystem.draw` returns it; `hj.plot.animate` reads it.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,4 +1,12 @@
-"""Systems modulo a symmetry: legs that are relabeled, a position that has no effect."""
+"""`Symmetric`: a system modulo a symmetry, so that one step is a whole cycle.
+
+Two kinds of symmetry are possible: charts are mirror images of each other (legs change their
+roles), and a translation of some states has no effect (the distance walked). `Symmetric` keeps one
+chart of each pair and leaves out the translated states. A transition into a chart that is left out
+leads to its mirror image (`_landing`). `check_symmetry` tests, at points of the cycle, the
+statements (`_claims`) that would follow from the symmetry: if it refuses a symmetry that is right,
+look there.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -98,12 +106,12 @@ class Symmetric(Derived):
 
     @property
     def swap(self) -> dict[str, str]:
-        """Charts that are kept, each with its mirror image, which is left out."""
+        """The mirror image, which is left out, of each chart that is kept."""
         return dict(self.pairs)
 
     @property
     def _kept_of(self) -> dict[str, str]:
-        """Charts that are left out, each with its mirror image."""
+        """The chart that is kept, for each chart that is left out."""
         return {} if self.half_period else {b: a for a, b in self.pairs}
 
     def __check_init__(self):
@@ -238,7 +246,8 @@ class Symmetric(Derived):
         return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
 
     def whole(self, at: Guess) -> tuple[HybridSystem, Guess] | None:
-        """With `half_period`, the system whose cycle has both halves, and there a state of this."""
+        """With `half_period`: the original system, whose cycle has both halves, and the given state
+        in it. Otherwise None."""
         if not self.half_period:
             return None
         if self.charts()[at.chart].clocked:
@@ -249,9 +258,9 @@ class Symmetric(Derived):
         return Symmetric(self.system, translation=self.translation), at
 
     def _claims(self, sizes: Mapping[str, Any]):
-        """The statements of the symmetry: a sentence for its failure, and two functions of
-        (t, q, u) that are equal. The first numbers of q are the state without translations, in
-        its `sizes`."""
+        """Iterate over the statements of the symmetry. Each is a sentence for the error, and two
+        functions of (t, q, u) that must be equal. The first numbers of q are the state without
+        translated states, in units of `sizes`."""
         if self.translation:
             yield from self._claims_of_translation(sizes)
         clock: Any = self.system.period()
@@ -259,7 +268,8 @@ class Symmetric(Derived):
         later = 0.5 * clock if self.half_period is True else 0.0
         for kept, other in self.swap.items():
             ours = list(self._parts(kept, self._kept_of, sizes))
-            # In a chart that is its own mirror image, the last transition is that of the first.
+            # In a chart that is its own mirror image, the last transition is the mirror image of
+            # the first.
             back = kept == other
             theirs = list(self._parts(other, images, sizes, later=later, back=back))
             if len(ours) != len(theirs):
@@ -279,9 +289,9 @@ class Symmetric(Derived):
                 yield f"the {what} changes under the translation", before, after
 
     def _parts(self, name, images, sizes, shift=None, later=0.0, back=False):
-        """All functions of a chart, of points of the reduced one, with rates and states mirrored if
-        the chart is among the `images`; transitions in the order of their list, or `back`; under a
-        translation by `shift`, outputs, too."""
+        """All functions of a chart, as functions of points of the reduced chart. Rates and states
+        are mirrored if the chart is among the `images`. With `back`, transitions are in reverse
+        order. With `shift`, states are translated by it, and outputs are included."""
         kept = images.get(name, name)
         chart = self._reduced(kept)
         original = self.system.charts()[name]
@@ -372,8 +382,8 @@ def check_symmetry(
     """Raise an error if functions, or with `along` their derivatives by this parameter, do not have
     the symmetry that a `Symmetric` states.
 
-    **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (In units in
-    which states are small, states of 1 hide all but the highest powers.)
+    **Arguments:** `sizes`: magnitudes of the states of each chart. Default: 1. (With states of
+    magnitude 1 in unsuitable units, the highest powers would hide all other terms.)
     """
     if not isinstance(system, Symmetric):
         return
@@ -429,7 +439,7 @@ def _phase_of(guard: Scheduled) -> Callable:
 
 
 class _Reduced(DerivedChart):
-    """A chart without the states of a translation; if `clocked`, the time is its last state."""
+    """A chart without the translated states. If `clocked`, the time is its last state."""
 
     translation: Sequence[str] = eqx.field(static=True)
     clocked: bool = eqx.field(static=True)

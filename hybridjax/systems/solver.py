@@ -1,4 +1,10 @@
-"""How a chart is integrated: Runge-Kutta methods, of diffrax or of this package."""
+"""Runge-Kutta methods by which charts are integrated: those of diffrax, and `Radau` of this
+package.
+
+`as_method` converts any of these to a `Method`: the coefficients, in the form that
+`engine/runge_kutta.py` uses. `solvers` checks what a user gives for a system (one solver, or one
+for each chart).
+"""
 
 import functools as ft
 from collections.abc import Mapping
@@ -30,11 +36,11 @@ class Method(NamedTuple):
     error: Row
     """Weights of the increments in the estimate of the error."""
     order: float
-    """The error by which steps are controlled grows as this power of the step."""
+    """The error that controls the steps grows as this power of the step length."""
     gain: float = 1.0
-    """The error is this power of the estimate."""
+    """The error is the estimate to this power."""
     rough: Row = ()
-    """Weights of the increments in an estimate of one order less, if the power is not 1."""
+    """Weights of the increments in an estimate of one order less, needed if `gain` is not 1."""
     filter: float = 0.0
     """The estimate is multiplied by (1 - h g J)^-1, with this g."""
 
@@ -92,7 +98,7 @@ def solvers(
 ) -> Solver | Method | ByChart | None:
     """A solver as it is, and solvers by the names of charts in a form that can be compared.
 
-    **Raises:** `DefinitionError` for what is no solver.
+    **Raises:** `DefinitionError` for an object that is no solver.
     """
     each = list(given.values()) if isinstance(given, Mapping) else [given]
     for solver in each:
@@ -106,7 +112,8 @@ def solvers(
 def as_method(solver: Any) -> Method:
     """The Runge-Kutta method of a solver.
 
-    **Raises:** `DefinitionError` for what is none with an error estimate.
+    **Raises:** `DefinitionError` for an object that is no Runge-Kutta method with an error
+    estimate.
     """
     if not isinstance(solver, Method | eqx.Module):
         raise _no_solver(solver)

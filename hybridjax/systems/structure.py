@@ -1,12 +1,14 @@
-"""The structure of a hybrid system: charts and transitions by index, functions in one form.
+"""`Structure`: a hybrid system by the indices of its charts and transitions, with functions in one
+form.
 
-The engine evaluates a system through `Structure`: functions return arrays, and guards fall through
-zero at their event.
+The engine evaluates a system only through its `Structure`. Functions take (t, q, u) and return
+arrays, and guards are signed so that they fall through zero at their event. A wrong sign of a guard
+or a wrong index of a transition has its cause here.
 
-Contacts that are written once and differ by an index are of one kind: of
-`[Transition(..., guard=Contact(self, i), ...) for i in range(n)]`, the number in which they differ
-(`i`) becomes an argument of one function, so that n contacts are traced, compiled and evaluated as
-one.
+Transitions that are written once and differ only in a number are of one *kind*. For example, in
+`[Transition(..., guard=Contact(self, i), ...) for i in range(n)]`, the number `i` becomes an
+argument of one function, so that n contacts are traced, compiled and evaluated as one. `kinds`
+finds them.
 """
 
 import dataclasses
@@ -46,7 +48,8 @@ the numbers that they hold."""
 
 
 class Member(NamedTuple):
-    """A transition, or one for each lane, by its kind and its index there, which may be traced."""
+    """A transition, or one for each lane (trajectory), given by its kind and its index within the
+    kind. The index may be traced."""
 
     kind: Kind
     place: Int[Array | np.ndarray, "..."]
@@ -61,7 +64,7 @@ def kinds(transitions: Sequence[Transition]) -> list[Kind]:
 
 
 def member_of(alike: Sequence[Any], place: Any) -> Any:
-    """The pytree with this index among pytrees that differ in numbers only."""
+    """Select the pytree with index `place` among pytrees that differ only in numbers."""
     leaves, structures = zip(*map(jax.tree_util.tree_flatten, alike), strict=True)
 
     def select(column: tuple) -> Any:
@@ -89,7 +92,8 @@ def counts_alike(program: jax_compat.Program) -> bool:
 
 
 def _form(x: Transition) -> Hashable:
-    """All that functions of one kind have in common; `None` if x is the only one of its kind."""
+    """A key that is equal for transitions of one kind; `None` if x can have no others of its
+    kind."""
     if isinstance(x.guard, Scheduled):
         return None
     leaves, structure = jax.tree_util.tree_flatten((x.guard, x.reset, x.enabled))
@@ -165,9 +169,9 @@ _clocks_of_programs: dict[tuple, np.ndarray] = {}
 class Structure:
     """Charts and transitions of a system by index.
 
-    Built where a public call begins, and handed on. It is a pytree whose only child is the system,
-    so that transformations of JAX take it as an argument, and each trace gets its own. Within one
-    trace, a function of the system is traced once, however often it is used.
+    A `Structure` is built at the beginning of a public call, and handed on. It is a pytree whose
+    only child is the system: transformations of JAX take it as an argument, and each trace gets a
+    copy. Within one trace, each function of the system is traced once, however often it is used.
     """
 
     def __init__(self, source: "HybridSystem | PerLane"):
@@ -186,8 +190,8 @@ class Structure:
         return shared(self.source)
 
     def _once_in_call(self, name: str, make: Callable[[], Any]) -> Any:
-        """Return what other structures of the system have made in this public call. (A trace of JAX
-        makes its own: constants belong to it.)"""
+        """Return an object that another structure of the same system has made in this public call,
+        or make it. (In each trace of JAX it is made again, since constants belong to a trace.)"""
         system = self.system
         if is_hidden(system):
             return make()
@@ -281,8 +285,8 @@ class Structure:
         trees=(),
         lanes=1,
     ) -> Callable:
-        """`function(*static, structure, *trees, *point)` in this form for arrays of the host,
-        compiled (see `_core/compilation.py`)."""
+        """Compile `function(*static, structure, *trees, *point)` in a form (see
+        `engine/kernels.py`), for arrays of the host (see `_core/compilation.py`)."""
         name = function, form, static, lanes
 
         def make():
@@ -304,7 +308,8 @@ class Structure:
         return self
 
     def once(self, name: Hashable, trees: tuple, make: Callable[[], Any]) -> Any:
-        """Return what was made under this name for these trees, made anew only for other trees."""
+        """Return the object that was made under this name for these trees; call `make` only if
+        there is none."""
         if name in self._made:
             made, before = self._made[name]
             if all(map(operator.is_, before, trees)):
@@ -370,8 +375,8 @@ class Structure:
         return _kinds.recall(self.source, None, make)
 
     def _is_one(self, kind: Kind) -> bool:
-        """Test whether functions can be traced with the numbers in which they differ as arguments
-        and then mean the same. (They cannot if Python branches on a number.)"""
+        """Test whether functions of a kind can be traced with their differing numbers as arguments,
+        and still mean the same. (They cannot if Python branches on a number.)"""
         n = self.dims[self.chart_index(self.transitions[kind[0]].source)]
 
         def at_a_point(s, place, *point):
@@ -416,10 +421,10 @@ class Structure:
     def clocks(self) -> Int[np.ndarray, " G"]:
         """The clock of each transition by number, negative for those of a guard.
 
-        Schedules with the same formulas for period and offset are one clock, each of whose ticks
-        leads to one event: of a chart that a tick enters, the transition of the same clock waits
-        for the next tick. Clocks of other formulas may tick at the same time, such as
-        `Scheduled(T)` and `Scheduled(T, duty * T)` at duty 0, and each then leads to an event.
+        Schedules with the same formulas for period and offset are one clock. Each tick of a clock
+        leads to one event: in the chart that a tick enters, the transition of the same clock waits
+        for the next tick. Different clocks, such as `Scheduled(T)` and `Scheduled(T, duty * T)` at
+        duty 0, may tick at the same time, and each then leads to an event.
         """
         return _all_clocks.recall(self.source, None, self._clocks_of_program)
 
@@ -427,7 +432,7 @@ class Structure:
         system = one_lane(self.source)
         if not program_digest(system):
             return self._clocks()
-        # (Systems with the same programs share them, whatever their numbers.)
+        # (Systems with the same programs have the same clocks, whatever their parameters are.)
         program = identity(system)
         if program not in _clocks_of_programs:
             _clocks_of_programs[program] = self._clocks()
@@ -445,7 +450,8 @@ class Structure:
         return numbers
 
     def _formula(self, g: int) -> Hashable:
-        """How the period and the offset of a schedule follow from the numbers of the system."""
+        """A key of the formulas by which period and offset of a schedule follow from the parameters
+        of the system."""
 
         def schedule(system: HybridSystem):
             guard = list(system.transitions())[g].guard
@@ -492,8 +498,8 @@ class Structure:
         q: Array,
         u: Array,
     ) -> list[jax.Array]:
-        """All guards of some kinds, in parts: a vector for each kind, or numbers if each guard is
-        the only one of its kind."""
+        """All guards of some kinds: a vector for each kind, or single numbers if each guard is the
+        only one of its kind."""
         if all(len(kind) == 1 for kind in kinds):
             return [self.guard(g, t, q, u) for (g,) in kinds]
 

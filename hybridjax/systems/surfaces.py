@@ -1,4 +1,9 @@
-"""Sliding: motion along a surface at which the field jumps, and which both sides push into.
+"""Sliding: motion along a surface at which the vector field jumps, where the fields of both sides
+point towards the surface.
+
+`filippov` returns the charts (two sides, and a `SlidingChart`) and the transitions between them.
+The field of sliding is the combination of both fields that is tangent to the surface
+(`SlidingChart.field`).
 
 A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, 1988; V. I. Utkin,
 Sliding Modes in Control and Optimization, 1992.
@@ -21,9 +26,9 @@ class FilippovParts(NamedTuple):
     """Charts and transitions that `filippov` makes."""
 
     charts: dict[str, Chart]
-    """The two charts that were given, and that of sliding."""
+    """The two given charts, and the chart of sliding."""
     transitions: list[Transition]
-    """Between these three."""
+    """Transitions between these three charts."""
 
 
 @checked
@@ -124,7 +129,7 @@ class SlidingChart(DerivedChart):
         return [as_vector(chart.field(t, q, u)) for chart in (self.chart, self.below)]
 
     def rates(self, t, q, u):
-        """Those of the surface's function in both fields."""
+        """Rates of the surface's function along both fields."""
         t = jnp.asarray(t, float)
         q = jnp.asarray(q, float)
 
@@ -140,8 +145,8 @@ class SlidingChart(DerivedChart):
         return (b * f - a * g) / (b - a)
 
     def returned(self, t, q, u):
-        """The effect (n, n) of a small push once the state is back on the surface, which either
-        side reaches by the same direction f_a - f_b."""
+        """Derivative (n, n) of the state, once it is back on the surface, by a small push. (From
+        either side, the state returns along the direction f_a - f_b.)"""
         f, g = self.fields(t, q, u)
         a, b = self.rates(t, q, u)
         t = jnp.asarray(t, float)

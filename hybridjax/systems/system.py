@@ -1,4 +1,10 @@
-"""A hybrid system: charts, transitions, inputs, outputs, and perhaps a clock."""
+"""`HybridSystem`, the class that users subclass: charts, transitions, inputs, outputs, and perhaps
+a clock.
+
+With it are `Output`, `parameter` and `Guess`. `Derived` changes parts of another system, and
+`Driven` adds an input that is a function of time. The engine reads systems through `structure.py`;
+a system is checked in `check.py`.
+"""
 
 import abc
 import contextvars
@@ -120,7 +126,8 @@ def parameter(
 
 
 def unit_of_parameter(system: Any, path: str) -> str:
-    """The unit of a parameter, that of a part of a part by a path with dots; "" if it has none."""
+    """The unit of a parameter, which may be a path with dots to a part of a part; "" if it has
+    none."""
     *parts, name = path.split(".")
     for part in parts:
         system = getattr(system, part)
@@ -128,7 +135,7 @@ def unit_of_parameter(system: Any, path: str) -> str:
 
 
 def arrays_of(system: "HybridSystem") -> dict[str, Array]:
-    """The arrays of a system by name, those of its parts by a path with dots."""
+    """The arrays of a system by name. Arrays of parts have names with dots."""
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(system, eqx.is_array))
     arrays = {}
     for path, leaf in leaves:
@@ -525,7 +532,8 @@ def integrated(system: HybridSystem, solver: Any) -> HybridSystem:
 
 
 class Derived(HybridSystem):
-    """A system made of another one, of which it has all that it does not define anew."""
+    """A system made from another system. Charts, transitions and so on that it does not define are
+    those of the other system."""
 
     system: HybridSystem
 
@@ -550,7 +558,8 @@ class Derived(HybridSystem):
 
 
 class Driven(Derived):
-    """`system` with an input that is a function of time, added to the piecewise constant one."""
+    """`system` with a further input that is a function of time. It is added to the piecewise
+    constant input."""
 
     drive: Callable[[Any], Any]
 

@@ -1,4 +1,9 @@
-"""Transitions between charts: guards, scheduled events and resets."""
+"""`Transition`: an event that leads from one chart to another, by a guard or a schedule
+(`Scheduled`), with a reset.
+
+Users make transitions; the engine reads them through `structure.py`. The two constants of the file
+say when two times are the same.
+"""
 
 from collections.abc import Callable
 from typing import Annotated, Any, Literal
@@ -17,9 +22,9 @@ from ..errors import DefinitionError
 
 
 Direction = Literal["falling", "rising"]
-# Times coincide if no more than this part of the period lies between them; a guard is due, in
-# another order of events, if it would be at zero within ten times as much. Smaller: rounding
-# separates events that coincide. Larger: events that are merely close are reported.
+# Times on a cycle coincide if they differ by less than this part of the period. A guard is due, in
+# another order of events, if it would be zero within ten times as much. Smaller: rounding separates
+# events that coincide. Larger: events that are merely close are reported.
 TOGETHER = 1e-9
 
 
@@ -28,11 +33,12 @@ def at_one_time(t: Array, other: Array, period: Array) -> Array:
     return abs(t - other) <= TOGETHER * period
 
 
-# Times of a schedule are equal if they differ by less than this part of its period, and numbers of
-# steps if they differ by less than it; a target's level counts once it is above the change that its
-# rate makes in this part of the time allowed. Higher: a piece of flow that ends shortly before an
-# event has it, and a level that falls right after the start is missed. Lower: an event happens
-# twice, a step of rounding errors is taken, or a level that was zero up to rounding is met.
+# Times of a schedule are equal if they differ by less than this part of its period. In the same
+# way, numbers of steps are equal if they differ by less than this; and the level of a target counts
+# only once it exceeds its change in this part of the time allowed. Higher: a flow that ends shortly
+# before an event includes the event, and a level that falls right after the start is missed. Lower:
+# an event happens twice, a step has the length of a rounding error, or a level that was zero up to
+# rounding is met again.
 SAME_TIME = 1e-11
 
 

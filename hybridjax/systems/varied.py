@@ -1,4 +1,8 @@
-"""Parameters by name, and parameters as inputs: a system whose inputs are added to them."""
+"""Parameters by name (`parameter_of`, `with_parameters`), and parameters as inputs (`Varied`).
+
+`Varied` is a structure whose single input is added to a parameter: derivatives by this input are
+derivatives by the parameter. Sensitivities and continuation use it.
+"""
 
 import operator
 from collections.abc import Mapping

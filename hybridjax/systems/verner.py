@@ -1,4 +1,5 @@
-"""The Runge-Kutta pair of charts that name no other: Verner's efficient 7(6), ten stages.
+"""`VERNER76`, the Runge-Kutta method of charts that name no other: Verner's efficient 7(6) pair
+with ten stages.
 
 J. H. Verner, Numerically optimal Runge-Kutta pairs with interpolants, Numer. Algorithms 53 (2010)
 383-396. The efficient 6(5) pair of the same paper needs two stages less, but its weights of +-176
@@ -32,8 +33,8 @@ def _verner() -> Method:
                 0.2188431703143157, 0.22898717054112028, 0.0, 0.0, 0.020295184663356284)
     c = (0.0, 0.005, 0.10888888888888888, 0.16333333333333333, 0.4555, 0.6095094489978381, 0.884,
          0.925, 1.0, 1.0)
-    # fmt: on
-    # The estimate has order 7; an eighth root is three square roots, and nearly as good.
+    # fmt: on (The estimate has order 7. Steps are controlled by an eighth root, which is three
+    # square roots and nearly as good.)
     return Method(
         "Verner 7(6)",
         a=tuple(row + (len(b) - len(row)) * (0.0,) for row in a),

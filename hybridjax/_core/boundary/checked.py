@@ -1,4 +1,10 @@
-"""The boundary between users and this package: what public functions take is checked there."""
+"""The decorators of public functions and classes: `checked`, `checked_methods`, `check_fields`.
+
+They compare each argument of a call with the `Kind` that the annotation stands for, and pass it on
+in one form, or raise a `DefinitionError` of one sentence. A kind is a description of the values
+that an argument may have (`values.py`, `containers.py`; the names used in annotations are in
+`kinds.py`).
+"""
 
 import functools
 import inspect
@@ -71,8 +77,8 @@ def checked(thing: Thing) -> Thing:
 
 
 def checked_methods(cls: Class) -> Class:
-    """A class whose public methods are checked, but not its constructor: results, which this
-    package makes, and JAX."""
+    """A class whose public methods are checked, but not its constructor. For results: only this
+    package, and JAX when it rebuilds a pytree, call their constructors."""
     for name, member in list(vars(cls).items()):
         if name.startswith("_") and name not in _OPERATORS:
             continue
@@ -154,8 +160,8 @@ def _is_constant(args: tuple, kwargs: dict[str, Any]) -> bool:
 
 
 def _constant(kinds: "_Kinds", args: tuple, kwargs: dict[str, Any]) -> Any:
-    """The result of a call that is a constant of the program that JAX traces. It is computed now,
-    and not in the program, so that its values are known to all that asks for them."""
+    """The result of a call that does not depend on what JAX traces. It is computed now and enters
+    the program as a constant, so that code which needs its values has them."""
     function = kinds.function
     try:
         with jax_compat.outside():
@@ -189,8 +195,7 @@ class _Kinds:
 
     @functools.cached_property
     def in_order(self) -> tuple[list[tuple[str, Kind | None]], tuple[str, Kind | None]]:
-        """Names and kinds of those that can be given by position, and of all further ones
-        (`*args`)."""
+        """Names and kinds of the parameters that can be given by position, and of `*args`."""
         named = []
         rest = ""
         for parameter in inspect.signature(self.function).parameters.values():
@@ -292,7 +297,7 @@ class _Names(NamedTuple):
     positional: tuple[str, ...]
     required: frozenset[str]
     needed_after: tuple[frozenset[str], ...]
-    """Those that have to be given by name, after so many by position."""
+    """At index n: the parameters that have to be given by name if n are given by position."""
     any_number: bool
     any_name: bool
 

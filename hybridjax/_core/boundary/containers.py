@@ -1,4 +1,8 @@
-"""Kinds that are made of others: choices, sequences, tables, objects of a class."""
+"""Kinds that are made of other kinds: choices, sequences, tables, objects of a class.
+
+A kind describes the values that an argument may have; `take` returns the value in the form in which
+functions use it, or raises `Misfit`. `checked.py` calls it, by way of the names in `kinds.py`.
+"""
 
 import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -56,7 +60,8 @@ class Having(Kind):
         self.allowed = f"an object with `{'` and `'.join(self.names)}`"
 
     def take(self, value):
-        # (The parts first: they have more, such as errors beside multipliers.)
+        # (The parts first: a part such as a fit has more than its whole, for example errors of the
+        # multipliers.)
         for thing in (*_parts(value), value):
             if self.fits(thing):
                 return thing
@@ -114,7 +119,7 @@ class Items(Kind):
 
 
 class Tuple(Kind):
-    """So many values, each of its own kind, in a list or a tuple."""
+    """A list or a tuple with one value for each of `kinds`."""
 
     def __init__(self, *kinds: Kind | None):
         self.kinds = kinds
@@ -153,8 +158,9 @@ class Table(Kind):
 
 
 class Names(Kind):
-    """One name, or several distinct ones, as a tuple. Objects of the class `other` may stand among
-    them. Without `empty` there must be one. With `units`, they may be the units by name."""
+    """One name, or several distinct ones, returned as a tuple. Objects of the class `other` may
+    stand among the names. Unless `empty`, at least one name is needed. With `units`, a table from
+    names to units is taken too."""
 
     def __init__(
         self,
@@ -205,8 +211,8 @@ def _taken(kind: Kind, key: Any, value: Any) -> Any:
 
 
 class Stream(Kind):
-    """Any iterable of objects of a class. A sequence is checked at once; what comes from elsewhere
-    is checked when it comes, and named as `argument`."""
+    """Any iterable of objects of a class. A sequence is checked at once; an item of any other
+    iterable is checked when it arrives, and errors name it `argument`."""
 
     def __init__(self, cls: type, argument: str):
         self.item = Instance(cls)

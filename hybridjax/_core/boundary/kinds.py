@@ -1,7 +1,8 @@
 """The words with which public signatures say what they take, beside plain types and `Literal`.
 
-Static type checkers see the plain type in each. What else is needed is written where it is needed:
-`Annotated[float, Number("a number above 1", above=1)]`, `Annotated[Numbers, Reals("N d")]`.
+Static type checkers see the plain type in each. A kind that only one function needs is written in
+its signature: `Annotated[float, Number("a number above 1", above=1)]`, `Annotated[Numbers, Reals("N
+d")]`.
 """
 
 import collections.abc

@@ -1,7 +1,9 @@
-"""Which call, argument or attribute does what a wrong call means: the sentences of errors.
+"""What an error message says to try instead: the call, argument or attribute that was probably
+meant.
 
-Users guess with the words of other libraries, and give an object of an earlier step. The tables in
-`guesses` are read only where an error is raised.
+Such a hint is called a lead here. Users guess with the words of other libraries, or give the result
+of an earlier step. `checked.py`, `members.py` and `public.py` ask for one when they raise an error.
+The tables in `guesses` are read only where an error is raised.
 """
 
 import dataclasses
@@ -9,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from ..public import about_word, is_namespace, place_of
-from ..spelling import spelled_alike
+from ..spelling import same_word, spelled_alike
 from . import words
 from .guesses.attributes import ATTRIBUTES
 from .guesses.functions import CALLED, IN_NAMESPACES, NAMES
@@ -23,7 +25,8 @@ from .values import Kind, Number, show, with_article
 _LISTED = 24
 
 
-# Likeness of two spellings at which one is the last guess for the other; see `spelling.py`.
+# Likeness of two spellings above which one is suggested for the other when nothing else was found;
+# see `spelling.py`.
 _ALIKE = 0.7
 
 
@@ -41,8 +44,8 @@ def about_name(package: str, name: str, places: Mapping[str, str]) -> str:
 
 
 def other_than(package: str, name: str) -> str | None:
-    """Return what a name of one namespace most often means in the package itself; None if it means
-    the name of the namespace."""
+    """Return what the package calls that which a name of one namespace most often means there; None
+    if the name of the namespace itself is meant."""
     is_class = name[0].isupper()
     if package != "hybridjax" or is_class:
         return None
@@ -59,7 +62,7 @@ def _leads_of_name(
 
     own = "" if namespace == "hybridjax" else namespace
     yield words.lead_of(NAMES, [own], name)
-    yield place(words.same_word(name, places))
+    yield place(same_word(name, places))
     yield words.lead_of(NAMES, [""], name)
     yield place(spelled_alike(name, places))
     yield words.lead_of_library([""], name)
@@ -187,7 +190,7 @@ def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
 
 
 def _documented(cls: type, name: str) -> str | None:
-    """Return the parameter of a system whose description has this word, or one like it."""
+    """Return the parameter of a system whose description has this word or a similar one."""
     if not dataclasses.is_dataclass(cls):
         return None
     parameters: dict[str, str] = {}
@@ -328,14 +331,14 @@ def _synonym(name: str, among: Collection[str]) -> str | None:
     for word in words.synonyms(name):
         if word in among:
             return word
-    return words.same_word(name, among)
+    return same_word(name, among)
 
 
 def about_object(
     function: str, kind: Kind | None, value: Any, given: Sequence[Any] = ()
 ) -> str:
-    """Return the call that makes what a function needs instead of a value, or the part of it that
-    is needed, as the rest of a sentence; "" if none is known.
+    """Return the rest of a sentence about a value that a function cannot use: the call that makes
+    the object it needs, or the part of the value that it needs; "" if none is known.
 
     **Arguments:** `function`: its name, of a method with its class. `given`: all arguments, whose
     names the call has.

@@ -1,5 +1,8 @@
-"""Attributes of public objects that are missing, that a user sets, or that are methods without a
-call: each leads on in one line."""
+"""Errors about attributes of public objects: one that is missing, one that a user sets, and a
+method that is used without calling it. Each message says in one line what to do instead.
+
+`checked.py` and `showable.py` put these functions into public classes.
+"""
 
 import dataclasses
 import functools
@@ -42,7 +45,7 @@ def fixed_attribute(self: Any, name: str, value: Any) -> None:
 
 class Method(eqx.Module):
     """A method with its object, as equinox binds methods: a pytree whose child is the object. It
-    prints how it is called, where equinox prints all numbers of the object."""
+    prints how to call it. (That of equinox prints all numbers of the object.)"""
 
     __func__: Callable = eqx.field(static=True)
     __self__: eqx.Module

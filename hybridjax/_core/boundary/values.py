@@ -24,8 +24,8 @@ class Misfit(Exception):
     """A value that does not fit. `problem` goes on where the name of the argument ends, and `path`
     leads from the argument to the value: "[2]", or "['k']".
 
-    A misfit is `near` if the value is of the right sort and something in it is wrong, so that
-    other sorts, which would do as well, need not be named.
+    A misfit is `near` if the value has the right type and something in it is wrong. The message
+    then does not name the other types that the argument may have.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Kind:
         raise self.refused(value)
 
     fits: Callable[[Any], bool]
-    """Whether a value is allowed, for kinds that hand it on as it is."""
+    """Whether a value is allowed. (For kinds whose `take` returns the value unchanged.)"""
 
     def __repr__(self) -> str:
         return self.allowed  # (as `help` shows it)

@@ -5,6 +5,7 @@ import importlib
 import re
 from collections.abc import Iterable, Iterator
 
+from ..spelling import plain
 from .guesses.sentences import LIBRARIES
 from .guesses.synonyms import ALIKE, WORDS
 
@@ -36,7 +37,7 @@ def _has(path: str, name: str) -> bool:
 
 def lead_of(table: dict, owners: Iterable[str], name: str) -> str | None:
     """Return the sentence of the whole name, of the first owner that has it."""
-    word = _plain(name)
+    word = plain(name)
     for owner in owners:
         sentence = _by_word(table, owner).get(word)
         if sentence is not None:
@@ -45,8 +46,8 @@ def lead_of(table: dict, owners: Iterable[str], name: str) -> str | None:
 
 
 def synonyms(name: str) -> tuple[str, ...]:
-    """Return the words of this package for a word of others, the best one first."""
-    return _all_words().get(name) or _plain_words().get(_plain(name), ())
+    """Return the words of this package for a word of other libraries, the best one first."""
+    return _all_words().get(name) or _plain_words().get(plain(name), ())
 
 
 def parts(name: str) -> Iterator[str]:
@@ -58,32 +59,16 @@ def parts(name: str) -> Iterator[str]:
             yield part.lower()
 
 
-def same_word(name: str, among: Iterable[str]) -> str | None:
-    """Return the name that differs only in case, underscores and number."""
-    by_word = {_plain(other).lower(): other for other in reversed(list(among))}
-    return by_word.get(_plain(name).lower())
-
-
 def with_part(part: str, among: Iterable[str]) -> str | None:
-    """Return the first name of which this is a part, or another word for the same."""
+    """Return the first name that contains this word, or another word for the same thing."""
     by_part: dict[str, str] = {}
     for name in among:
         for word in (name, *parts(name)):
-            by_part.setdefault(_plain(word), name)
+            by_part.setdefault(plain(word), name)
     for word in (part, *synonyms(part)):
-        if len(word) > 2 and _plain(word) in by_part:
-            return by_part[_plain(word)]
+        if len(word) > 2 and plain(word) in by_part:
+            return by_part[plain(word)]
     return None
-
-
-def _plain(word: str) -> str:
-    """Return a word without case, underscores and plural. (Single letters differ by case.)"""
-    plain = word.replace("_", "")
-    if len(plain) < 2:
-        return plain
-    plain = plain.lower()
-    is_plural = len(plain) > 3 and plain.endswith("s") and not plain.endswith("ss")
-    return plain[:-1] if is_plural else plain
 
 
 @functools.cache
@@ -99,7 +84,7 @@ def _all_words() -> dict[str, tuple[str, ...]]:
 def _plain_words() -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for word, meant in _all_words().items():
-        found.setdefault(_plain(word), meant)
+        found.setdefault(plain(word), meant)
     return found
 
 
@@ -111,5 +96,5 @@ def _by_word(table: dict[str, dict[str, str]], owner: str) -> dict[str, str]:
             continue
         for sentence, words in sentences.items():
             for word in words.split():
-                found.setdefault(_plain(word), sentence)
+                found.setdefault(plain(word), sentence)
     return found

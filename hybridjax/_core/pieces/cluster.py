@@ -1,4 +1,6 @@
-"""Pieces of work on the workers of a Dask cluster."""
+"""The part of `run.py` for Dask: hand pieces of work to the workers of a cluster, and check first
+that the workers would compute the same numbers.
+"""
 
 import contextlib
 import ctypes
@@ -67,7 +69,7 @@ def _run(
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))
     x64 = jax_compat.has_double_precision()
-    # Dask gives out the tasks again that a lost worker had, and what they need.
+    # If a worker is lost, Dask runs its tasks again, and also the tasks whose results they need.
     needed = client.submit(bytes, packed, pure=False)
     tasks = client.map(_piece, missing, packed=needed, x64=x64, pure=False)
     pieces = dict(zip(tasks, missing, strict=True))

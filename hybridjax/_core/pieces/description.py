@@ -1,4 +1,8 @@
-"""Descriptions of stored results, and digests in them."""
+"""Descriptions of stored results: what was computed, as JSON with digests in place of functions. By
+its description a later run recognizes results of the same job.
+
+`store.py` compares descriptions; the callers of `run.py` write them.
+"""
 
 import importlib.metadata
 from collections.abc import Mapping

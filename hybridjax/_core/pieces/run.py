@@ -1,4 +1,8 @@
-"""Work in independent pieces, done by this process or by the workers of Dask."""
+"""Run work that is divided into independent pieces, in this process or on the workers of Dask.
+
+A piece is a block of points (of a sweep, say) that one call computes. Called by `scale` and
+`experiments/stored.py`.
+"""
 
 from typing import Any, Protocol, runtime_checkable
 

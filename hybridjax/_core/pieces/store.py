@@ -73,8 +73,8 @@ def near_cube(shape: Sequence[int], most: int) -> tuple[int, ...]:
 class Variable(NamedTuple):
     """An array with a value for each point.
 
-    **Fields:** `dims` and `shape`: axes of each value beside those of the points. `attributes`:
-    units for example.
+    **Fields:** `dims` and `shape`: the axes of each value that follow the axes of the points.
+    `attributes`: units for example.
     """
 
     dtype: str
@@ -275,7 +275,8 @@ class ZarrStore:
         return data[[*dims, *self._arrays, *beside]].assign_attrs({_ABOUT: description})
 
     def _chunks(self, k: int) -> list[str]:
-        """Return the keys of the chunks of piece k, one along all axes but those of the points."""
+        """Return the keys of the chunks of piece k. (Along axes that are not those of the points
+        there is one chunk.)"""
         return [_key(x, self.layout.blocks.place(k)) for x in self._arrays.values()]
 
 

@@ -3,11 +3,11 @@
 XLA on CPU hands `jnp.linalg.solve` and its relatives to LAPACK, one matrix after the other: some
 150 ns for 3 equations, where the operations themselves, for several lanes at once, take 9 (for 7
 equations 310 and 60; if the matrix is symmetric and positive, 4 and 16). Programs that call LAPACK
-may also wait for each other for ever if they run in several threads. The functions below do the
-same in additions, multiplications, divisions and selections: unrolled, but for LU factors and
-`solve_by_columns`.
-`rewrite.vectorized` puts them into functions that were written with `jnp`. QR factorizations,
-eigenvalues, singular values and matrices of more than 12 rows are left to LAPACK.
+may also wait for each other for ever if they run in several threads. The functions below use
+additions, multiplications, divisions and selections instead, written out without loops (except LU
+factors and `solve_by_columns`). `rewrite.vectorized` puts them into functions that were written
+with `jnp`. QR factorizations, eigenvalues, singular values and matrices of more than 12 rows are
+left to LAPACK.
 
 Matrices stand on the last two axes. Where LAPACK would report a failure, results are NaN or
 infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, Matrix Computations,

@@ -2,10 +2,9 @@
 
 A function that a user has written with `jnp` is traced, and in its program (a jaxpr) the equations
 for sin, cos, tan, arctan, arctan2, arcsin and arccos are replaced by those of `trigonometry`, and
-the factorizations behind `jnp.linalg` by those of `factorizations`
-(docs/how-to/speed-up.md: reasons, accuracy). Where
-a later JAX has another name for what is looked for here, nothing is replaced, and all is as slow
-as it would be without.
+the factorizations behind `jnp.linalg` by those of `factorizations` (docs/how-to/speed-up.md:
+reasons, accuracy). If a later JAX renames these equations, they are not found and not replaced:
+results are right, and slower.
 """
 
 import functools as ft
@@ -140,7 +139,7 @@ def _replaced(program: Program, trigonometry: bool) -> Program:
 def _without_unused_factors(
     program: Program, equations: list[Equation]
 ) -> list[Equation]:
-    """Equations without the factorizations that no other one needs."""
+    """The equations, without factorizations whose results no other equation uses."""
     needed = set(filter(is_variable, program.outvars))
     for equation in equations:
         needed.update(filter(is_variable, equation.invars))

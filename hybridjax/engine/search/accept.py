@@ -1,4 +1,11 @@
-"""The rule by which a step is accepted or rejected, and the length of the next one."""
+"""The rule by which a step is accepted or rejected, and the length of the next one.
+
+The search attempts a step for each lane (a trajectory of many side by side; `attempt.py`). `accept`
+reads this attempt, and returns a `Verdict`, from which `outcome.py` makes the next state. A
+*watched function* is a guard or the level of the target section. An *approach* leads to a crossing
+that was met within a step: the lane aims at it, until a step *lands* on the zero. An event that is
+missed has its cause in `_crossing`, an approach without end in the first part of `accept`.
+"""
 
 from typing import NamedTuple
 
@@ -15,30 +22,30 @@ from .attempt import LANDING, LANDING_TRIES
 from .state import Aim, Attempt, State, Task
 
 
-# The next step has this part of the length that the error estimate asks for, and lies between these
-# multiples of the last one (the lower where the estimate is no number). Nearer to 1: more steps
-# are rejected. Farther: more steps are taken.
+# The next step has the part `_CAUTION` of the length that the error estimate asks for, and lies
+# between these multiples of the last step (the lower one if the estimate is NaN). Nearer to 1: more
+# steps are rejected. Farther: more steps are taken.
 _CAUTION = 0.9
 _SHRINK = 0.2
 _GROW = 3.0
 
 
 class Verdict(NamedTuple):
-    """The verdict on an attempted step: accepted on its `plain` way or where it `lands`; rejected
-    as `too_long`, or because of a crossing on the way."""
+    """The verdict on an attempted step. It is accepted without (`plain`) or with a landing
+    (`lands`), or it is rejected for one of the other reasons."""
 
     plain: Mask
     """The step is accepted, and ends on no zero."""
     lands: Mask
     """The step is accepted, and ends on the zero aimed at."""
     too_long: Mask
-    """Its error is too large."""
+    """The error of the step is too large."""
     refine: Mask
     """A watched function is not resolved: the step is halved."""
     crosses: Mask
     """A watched function crosses zero on the way: the lane approaches it."""
     closer: Mask
-    """The landing failed, but may be tried again from nearer by."""
+    """The landing failed, and is tried again by a shorter step."""
     lost: Mask
     """The landing failed for good."""
     touch: Mask
@@ -61,8 +68,8 @@ def accurate(new: Attempt, task: Task) -> Mask:
 
 
 def uneventful(state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
-    """Lanes whose step `accept` would accept on sight: accurate, no event, and no watched function
-    near a zero, save the target's level on which the lane lands."""
+    """Lanes whose step is certainly accepted: it is accurate, there is no event, and no watched
+    function comes near zero, except for the target's level if the lane lands on it."""
     at_guard = new.lands & (aim.which < len(task.s.transitions))
     calm = (
         new.calm
@@ -77,8 +84,8 @@ def uneventful(state: State, aim: Aim, new: Attempt, task: Task) -> Mask:
 def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdict:
     """Accept or reject the attempted steps, which end at t.
 
-    A step is accepted if it is accurate, every watched function is resolved over it, and none
-    crosses zero on the way before the zero on which it lands.
+    A step is accepted if it is accurate, if every watched function is resolved over it, and if no
+    watched function crosses zero before its end (or before the zero at which it ends).
     """
     approach = state.approach
     active = state.active
@@ -93,11 +100,11 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     lands = active & new.lands & falling & xp.where(approach.on, inside, within_error)
     failed = active & approach.on & ~lands
     closer = failed & (approach.tries < LANDING_TRIES)
-    # What is crossed on the way.
+    # Watched functions that cross zero on the way.
     fresh = active & ~approach.on & within_error
     looked_at = fresh | lands
     moved = step_length(aim, new)
-    # (Where an event is at once, nothing is crossed.)
+    # (If an event happens at once, the step has no length, and nothing is crossed.)
     ready = state.ready & ~aim.at_once
     crossing = _crossing(looked_at & ~aim.at_once, state, new, moved, ready)
     zero = width(t, task.span, end.rate)
@@ -130,7 +137,8 @@ def step_length(aim: Aim, new: Attempt) -> Times:
 
 
 def next_step(h: Times, aim: Aim, error: Times, lanes: Lanes, task: Task) -> Times:
-    """The length of the step after one with this error, where h was allowed."""
+    """The length of the next step, after a step that was allowed to have the length h and had the
+    error `error`."""
     s = task.s
     xp = namespace(error)
     error = error / task.stride.slack
@@ -152,7 +160,8 @@ def of_row(x: Array, which: Index) -> Times:
 def _crossing(
     some: Mask, state: State, new: Attempt, moved: Times, ready: Bool[Array, "W L"]
 ) -> CubicCrossing:
-    """The crossings on the way. (In a branch, so that XLA does not compute it for every user.)"""
+    """The crossings on the way. (In a branch: otherwise XLA would compute them once for every
+    use.)"""
     start = state.watched
     end = new.watched
     xp = namespace(ready)

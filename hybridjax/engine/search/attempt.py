@@ -1,5 +1,13 @@
-"""One step of every lane, before it is accepted: its end, on the zero that it aims at if it comes
-close, and how far it can be trusted."""
+"""One step of every lane, before it is accepted or rejected.
+
+`search.py` calls `attempt(state, aim, task)` in each iteration, and gets an `Attempt`: the state at
+the end of the step, its error, and how well the watched functions (guards, and the level of the
+target section) are known along the step. If a lane aims at a crossing and its step comes close to
+it, `land` moves the end of the step onto the zero. The cubic Hermite interpolant of each watched
+function stands for this function along the step, and `margin` is the estimated error of the
+interpolant. If steps are too long or too short, look at `_errors`; if events are missed, look at
+`_margin` and `_clearance`.
+"""
 
 from typing import NamedTuple
 
@@ -26,38 +34,38 @@ Present = Bool[Array, ""]
 # Higher: crossings whose times are right to five digits are called grazing. Lower: derivatives of
 # crossing times lose more digits before a grazing is reported.
 SLOW = 1e-5
-# A step is too long for a watched function if the cubic interpolant misses it by more than this
-# part of its size. Higher: functions that turn many times within a step are taken for their
-# interpolant, and events are missed. Lower: more steps (at 4e-3, twice as many of the hopper at a
-# tolerance of 1e-4).
+# A step is too long for a watched function if the error of its interpolant exceeds this part of the
+# function's magnitude. Higher: functions that turn many times within a step are not noticed, and
+# events are missed. Lower: more steps (at 4e-3, the hopper takes twice as many at a tolerance of
+# 1e-4).
 _BEND = 2e-2
 # The margin of an interpolant is this many times its error halfway. Higher: more steps. Lower: near
-# an extremum the error, which moves it, may be larger than the margin, and events are missed.
+# an extremum the error may be larger than the margin, and events are missed.
 _CAUTION = 2.0
 # The error of a derivative is estimated by a step from a state that is shifted by this part of its
 # size. Higher: second derivatives contribute. Lower: rounding errors do, and steps are then too
 # short where 1e-12 is asked for.
 _ASIDE = 3e-3
-# A lane lands if its crossing is nearer to the end of the step than this part of its length,
-# measured from its expected time. Higher: a method of order 4 goes further, and more landings are
-# rejected as too inaccurate. Lower: more steps until a lane lands.
+# A lane lands if the time between the crossing and the end of the step is less than this part of
+# the expected time to the crossing. Higher: the last correction (of order 4) is longer, and more
+# landings are rejected as inaccurate. Lower: more steps until a lane lands.
 _LANDING_REACH = 0.25
-# A landing in a chart with an implicit method may add this part of the error that a step may have:
-# no later step damps it before the section. Higher: sections have errors that nobody reports.
-# Lower: more steps until a lane lands.
+# In a chart with an implicit method, a landing may add only this part of the error that a step may
+# have, since no later step damps the error of a landing before the section. Higher: sections have
+# errors that nobody reports. Lower: more steps until a lane lands.
 _LANDING_PART = 1e-2
-# A landing is accurate to this part of the step: its last correction is at most as large (or lasts
-# no longer than an instant), and it lies no farther beyond the step in which the crossing was met.
-# Corrections square their error. Higher: a crossing is off by more than a replay corrects to
-# rounding. Lower: landings are repeated.
+# Accuracy of a landing, as a part of the step: its last correction is no longer (or lasts at most
+# an instant), and the zero lies no farther beyond the step in which the crossing was met. Each
+# correction squares the error. Higher: the two corrections of a replay do not reach rounding.
+# Lower: landings are repeated.
 LANDING = 1e-6
-# Attempts to land on a crossing before the step in which it was met is halved. Higher: they cost
-# time where the cubic interpolant is no guide to the crossing. Lower: steps are halved too early.
+# Attempts to land on a crossing before the step is halved. Higher: attempts take time where the
+# interpolant gives no good guess of the crossing. Lower: steps are halved too early.
 LANDING_TRIES = 8
 
 
 class Landing(NamedTuple):
-    """Ends of steps, of lanes that land on the zero itself."""
+    """Ends of steps. Of lanes that land, these are the zeros themselves."""
 
     q: States
     f: States
@@ -65,11 +73,11 @@ class Landing(NamedTuple):
     """Time from the end of the step to the zero, as far as is known."""
     lands: Mask
     error: Times
-    """Error of the way from the step's end to the zero, relative to the tolerance."""
+    """Error of the correction from the step's end to the zero, relative to the tolerance."""
     middle: States
     """State halfway from the start of the step to the zero."""
     rate: States
-    """Its rate there."""
+    """Rate of the state halfway."""
 
 
 def land(
@@ -84,7 +92,8 @@ def land(
 ) -> Landing:
     """The zero of the function aimed at, before or beyond the end of a step from (t, q).
 
-    `before` are the watched functions at its start, `allowed` the errors that it may have.
+    **Arguments:** `before`: watched functions at the start of the step. `allowed`: errors that the
+    landing may have.
     """
     xp = namespace(t)
     tau = aim.step
@@ -93,13 +102,14 @@ def land(
     v0, r0, v1, r1 = (pick(x, flow.rows, which) for x in (*before, *after))
     by_cubic = tau * (root_near_end(v0, v1, tau * r0, tau * r1) - 1)
     by_newton = -v1 / xp.where(r1 == 0, 1.0, r1)
-    # (The cubic between the ends of a very short step is a worse guess than Newton's.)
+    # (After a very short step, Newton's guess is better than that of the cubic.)
     first = xp.where(tau > 1e-3 * aim.reach, by_cubic, by_newton)
     near = (which >= 0) & (xp.abs(first) <= aim.reach)
     first = xp.where(near, first, 0.0)
     end = flow.locate(t + tau, step.q, step.f1, which, first)
     share = xp.abs(first) / xp.where(aim.reach > 0, aim.reach, 1.0)
-    # (A short step is explicit: where modes die out within it, it has no orders of the method's.)
+    # (The correction is an explicit step: where modes die out within it, its error estimate has no
+    # order.)
     weight = (
         1 / _LANDING_PART
         if flow.method.implicit
@@ -121,7 +131,8 @@ def land(
 
 
 def attempt(state: State, aim: Aim, task: Task) -> Attempt:
-    """Let the active lanes step, and land those that come close to the zero they aim at."""
+    """Let the active lanes take a step. Lanes that come close to the zero at which they aim land on
+    it."""
     s = task.s
     lanes = state.lanes
     L = state.lanes.t.shape[0]
@@ -169,7 +180,8 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
             margin = _margin(flow, before, after, end, t, moved, task.span)
             bent = _bent(before, after, margin)
             chosen = (np.array(rows)[:, None] == which) & end.lands
-            # (Where events coincide, the step to the second is rounding, and tells no speed.)
+            # (Where events coincide, the step to the second event is a rounding error, from which
+            # no speed of the crossing can be computed.)
             judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
             ready = take_rows(state.ready, rows)
             far, slow = _clearance(before, after, margin, moved, ready, judged)
@@ -200,15 +212,14 @@ def _step(
     along: States | None,
     task: Task,
 ) -> tuple[Step, States | None, States | None]:
-    """A step; where derivatives matter, the deviation after it (of implicit methods), and the
-    change of its error by a deviation.
+    """A step. Where derivatives matter, also the change of its error by a deviation of the state,
+    and, for implicit methods, the deviation after the step.
 
-    An explicit step is asked for the error of a deviation that begins with the step. An implicit
-    one is asked for that of a deviation that began with the flow or at the last event, and may have
-    died out since, as it does where a chart is stiff.
+    With an explicit method, the deviation begins with the step. With an implicit method, it began
+    with the flow or at the last event: in a stiff chart it may have died out since.
     """
 
-    # (A branch, since XLA would mask the states again in every stage.)
+    # (In a branch: otherwise XLA would mask the states again in every stage.)
     def plain():
         return flow.step(t, q, tau)
 
@@ -233,15 +244,15 @@ def _step(
 def _errors(
     flow: ChartFlow, t, q: States, tau, step: Step, change, along, task: Task
 ) -> tuple[States, AnyTimes]:
-    """The error that a step may have, and its error relative to that, with that of a derivative:
-    a state at rest has no error of its own."""
+    """The error that a step may have, and the error of the step relative to this. The error of a
+    derivative of the state is included, since a state at rest has no error of its own."""
     xp = namespace(q)
     settings = task.settings
     a = flow.a
     assert settings.rtol is not None
     rounding = xp.zeros_like(q)
     if settings.scale is None:
-        # (At the start: a bad step may end anywhere.)
+        # (At the start of the step, since a bad step may end anywhere.)
         rounding = rounding_error(flow.field, t, q, step.f0)
     allowed = tolerance(settings, a, q, tau, step, rounding)
     motion = step.error if change is None else step.estimate
@@ -249,7 +260,7 @@ def _errors(
     if change is not None:
         scale = size(settings, a, q, step.q)
         if settings.scale is None:
-            # (Beside a state that is just small, others would never be accurate enough.)
+            # (Relative to a state that happens to be small, no error would be small enough.)
             scale = xp.broadcast_to(xp.max(scale, axis=0), scale.shape)
         if along is None:
             scale = _ASIDE * scale
@@ -266,11 +277,12 @@ def _errors(
 def _halfway(
     q: States, step: Step, end: States, f: States, tau: Times, moved: Times
 ) -> tuple[States, States]:
-    """The state and its rate halfway from q to the `end`, where the field is f and which has
-    `moved` a little farther or less far than the step over tau.
+    """The state and its rate halfway from q to the `end`, where the field is f. `moved` is the
+    length of the way to the end, and tau the length of the step, which is a little longer or
+    shorter.
 
-    They are those of the cubic, and that by which the step differs from its own, which grows as h^4
-    and h^3.
+    The values of the cubic are corrected by the difference between the step's own middle and its
+    cubic. The difference grows as h^4, and that of the rates as h^3.
     """
     xp = namespace(q)
     middle, rate = halfway_cubic(q, step.q, step.f0, step.f1, tau)
@@ -290,8 +302,8 @@ def _margin(
     moved: AnyTimes,
     span: Times,
 ) -> Float[Array, "W L"]:
-    """How far watched functions may be from their cubic interpolants over a way that has `moved`:
-    by their values and rates halfway, less those of the interpolants, beyond rounding errors."""
+    """The margin: how far watched functions may be from their cubic interpolants. It is computed
+    from the differences of values and rates halfway, less rounding errors."""
     xp = namespace(moved)
     true = flow.watch(t + 0.5 * moved, end.middle, end.rate)
     d0 = moved * before.rate
@@ -304,8 +316,7 @@ def _margin(
 
 
 def _bent(before: Watch, after: Watch, margin: Float[Array, "W L"]) -> Mask:
-    """Test whether a watched function is not resolved by its cubic interpolant, or there is
-    none."""
+    """Test whether the margin of a watched function is too large, or NaN."""
     xp = namespace(margin)
     size = xp.abs(before.value) + xp.abs(after.value)
     bent = (margin > _BEND * size) | xp.isnan(margin)
@@ -320,8 +331,8 @@ def _clearance(
     armed: Flags,
     judged: Flags,
 ) -> tuple[Flags, Mask]:
-    """Test whether watched functions stay away from zero, by bounds of their interpolants and the
-    margin of these, and find lanes that land on a `judged` zero at a vanishing speed."""
+    """Test whether watched functions stay away from zero, by bounds of their interpolants and
+    margins. Also find lanes that land at a vanishing speed, on zeros that are `judged`."""
     xp = namespace(moved)
     ends = before.value, after.value, moved * before.rate, moved * after.rate
     low, high = bounds(*ends, margin)
@@ -329,7 +340,7 @@ def _clearance(
         armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0
     )
     fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
-    # (By rounding, the zero may lie a little before the start.)
+    # (With rounding errors, the zero may lie a little before the start.)
     return far, (judged & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)
 
 

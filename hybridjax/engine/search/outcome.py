@@ -1,8 +1,10 @@
 """Outcome of attempted steps: accepted states, events, and reasons to stop.
 
-`without_events` is the short way, for iterations in which no lane comes near an event; all others
-take `with_events`. Where both apply they must agree. `with_events` lists the failures: the first
-one that holds is the `Result` of the lane.
+`search.py` calls one of two functions in each iteration, with the attempted steps of all lanes, and
+gets the next `State` and the row of the tape: `without_events` if no lane comes near an event, and
+`with_events` otherwise. Both must give the same result where both apply. In `with_events`, the
+failures are a list: the first one that holds is the `Result` of the lane. If a reason of a failure
+is wrong, look there; if a state after an event is wrong, look at `_reset`.
 """
 
 import numpy as np
@@ -35,16 +37,17 @@ from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
 
-# A guard that would turn within so many half rounding errors below zero is touched (grazing).
-# Higher: crossings whose derivatives are right to four digits are called grazing. Lower:
+# A crossing is a grazing if the guard would turn less than this many half rounding errors below
+# zero. Higher: crossings whose derivatives are right to four digits are called grazing. Lower:
 # derivatives of crossings are made of rounding errors.
 _SHALLOW = 1e5
-# Only crossings slower than this part of the rate at the start of the step may be that shallow.
-# Higher: rounding errors are computed for more events. Lower: steps from nearer by hide a touch.
+# Only crossings slower than this part of the guard's rate at the start of the step are tested for
+# `_SHALLOW`. Higher: rounding errors are computed for more events. Lower: a grazing is missed after
+# a short step.
 _MAY_BE_SHALLOW = 0.1
-# The shortest step near t = 0, where times resolve any step, as a part of the time allowed. Larger:
-# events of states that are about to leave all bounds, as spikes of a neuron, are missed. Smaller:
-# more steps until a blow-up is reported.
+# The shortest step near t = 0, as a part of the time allowed. Larger: events just before a state
+# would leave all bounds (spikes of a neuron) are missed. Smaller: more steps until a blow-up is
+# reported.
 _SHORTEST = 1e-18
 
 
@@ -111,7 +114,8 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     h, stuck = _next_step(state, aim, new, verdict, fired, task)
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
-    # (Any part between rounding errors and a tenth tells a field that jumps from a blow-up.)
+    # (Any threshold between rounding errors and a tenth distinguishes a field that jumps from a
+    # blow-up.)
     change = xp.max(xp.abs(new.q - lanes.q), axis=0)
     size = xp.max(xp.abs(lanes.q), axis=0)
     still = (change <= 1e-3 * size) | ((size == 0) & xp.isfinite(change))
@@ -169,8 +173,9 @@ def _after(
     t: Times,
     task: Task,
 ) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
-    """Lanes after their steps and events, the watched functions there, whether the target's level
-    counts, whether events accumulate, and whether a zero is crossed at a vanishing speed."""
+    """The state after steps and events. Returns the lanes, their watched functions, and three
+    masks: the next fall of the target's level counts (`level_counts`), events accumulate, a zero is
+    crossed at a vanishing speed."""
     lanes = state.lanes
     end = new.watched
     accepted = verdict.accepted
@@ -206,7 +211,8 @@ def _after(
 def _is_shallow(
     state: State, aim: Aim, new: Attempt, verdict: Verdict, t: Times, task: Task
 ) -> Mask:
-    """Test for lanes that land on a guard which would turn a few rounding errors below zero."""
+    """Test which lanes land on the zero of a guard that would turn a few rounding errors below
+    zero."""
     s = task.s
     if not s.transitions:
         return verdict.lands & False
@@ -235,8 +241,8 @@ def _reset(
     fired: Index,
     task: Task,
 ) -> tuple[Lanes, Watch, Mask]:
-    """Lanes after the resets of their events, the watched functions there, and whether the target's
-    level counts."""
+    """Lanes after the resets of their events, their watched functions, and whether the next fall of
+    the target's level counts."""
     s = task.s
     xp = namespace(fired)
     fires = fired >= 0
@@ -255,9 +261,9 @@ def _reset(
 
 
 def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
-    """The guards of the charts of lanes after resets, `new`, that the charts before had, too.
+    """Compare the guards of the charts after resets (`new`) with those of the charts before.
 
-    (Charts of other numbers of states have no guards in common.)
+    (Charts with different numbers of states have no guards in common.)
     """
     s = task.s
     xp = namespace(lanes.t)
@@ -266,8 +272,8 @@ def _entry(lanes: Lanes, watched: Watch, new: Lanes, task: Task) -> Entry:
     alike = ~same & (dims[lanes.chart] == dims[new.chart])
 
     def compare():
-        """Guards of the new chart (rows) with the value that one of the old chart (columns) has at
-        the state before."""
+        """For each guard of the new chart (rows) and of the old chart (columns), whether both have
+        the same value at the state before."""
         before = watch(s, lanes.t, new.chart, lanes.q, task.u, task.target, alike)
         noise = guard_noise(s, lanes._replace(chart=new.chart), task.u, alike)
         value = before.value[:-1]
@@ -299,8 +305,8 @@ def _share_guards(s: Structure) -> bool:
 
 
 def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> Approach:
-    """The crossing that each lane approaches next: one met in this step, or the same from nearer
-    by."""
+    """The crossing that each lane approaches next: a crossing that was met in this step, or the one
+    that it approached before."""
     approach = state.approach
     crosses = verdict.crosses
     which = verdict.which
@@ -322,21 +328,22 @@ def _approach(state: State, new: Attempt, verdict: Verdict, moved: Times) -> App
 def _next_step(
     state: State, aim: Aim, new: Attempt, verdict: Verdict, fired: Index, task: Task
 ) -> tuple[Times, Mask]:
-    """The next step, and lanes that are stuck: the step is too short to be taken."""
+    """The length of the next step, and which lanes are stuck, since this step is too short to be
+    taken."""
     xp = namespace(fired)
     plain = verdict.plain
     too_long = verdict.too_long
     adapted = next_step(state.h, aim, new.error, state.lanes, task)
     h = xp.where(plain | too_long, adapted, state.h)
-    # After an event the step may be as long as the first one of the flow. (Without usual sizes of
-    # states that one is a guess, which would be rejected after every event.)
+    # After an event the step may be as long as the first step of the flow. (If magnitudes of states
+    # are not known, the first step was a guess, which would be rejected after every event.)
     restart = adapted if task.settings.scale is None else task.stride.h
     h = xp.where(fired >= 0, xp.maximum(h, restart), h)
     h = xp.where(verdict.lost, 0.5 * aim.reach, h)
     h = xp.where(verdict.refine, 0.5 * aim.step, h)
     instant = INSTANT * task.span
     t = state.lanes.t
-    # (A fast state needs steps that are shorter than an instant, as far as times resolve them.)
+    # (A fast state needs steps shorter than an instant, down to the rounding error of t.)
     shortest = xp.minimum(instant, ROUNDING * xp.abs(t) + _SHORTEST * task.span)
     misses = verdict.refine | verdict.lost
     stuck = (too_long & (h < shortest)) | (misses & (h < instant))
@@ -344,7 +351,8 @@ def _next_step(
 
 
 def level_counts(watched: Watch, span: Times) -> Mask:
-    """Test whether the target's level is clearly positive, so that its next fall counts."""
+    """Test whether the target's level is clearly positive, so that its next fall through zero ends
+    the flow."""
     return watched.value[-1] > SAME_TIME * span * abs(watched.rate[-1])
 
 
@@ -358,7 +366,7 @@ def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:
 def _expected(
     sequence: tuple[int, ...] | None, events: Index, fired: Index
 ) -> Bool[Array, " L"]:
-    """Test whether the next event of each lane is that of the limit cycle."""
+    """Test whether the next event of each lane is the one that follows on the limit cycle."""
     xp = namespace(fired)
     if not sequence:
         return xp.full(fired.shape, sequence is None)

@@ -1,11 +1,14 @@
-"""Adaptive flow of many lanes to their targets, through any number of events.
+"""Adaptive flow of many lanes (trajectories side by side) to their targets, through any number of
+events.
 
-The search decides on step sizes, on the order of events, and on failures. It is not differentiated;
-its decisions are recorded in a `Tape`, which `replay` follows.
+`engine/move.py` and `engine/flow.py` call `search`, with arrays of NumPy or of JAX. It decides on
+step sizes, on the order of events, and on failures. It is not differentiated: its steps are
+recorded on a `Tape`, and `replay.py` differentiates these.
 
-Each iteration takes aim (the length of the step, up to the next known time), attempts the step
-(`attempt.py`), judges it (`accept.py`), and updates the state (`outcome.py`). A missed event has
-its cause in `accept.py` or `../cubic.py`, a wrong reason of a failure in `outcome.py`.
+Each iteration has four stages: `take_aim` chooses the length of the step, up to the next known
+time; `attempt.py` computes the step; `accept.py` accepts or rejects it; `outcome.py` makes the next
+state. If an event is missed, look first in `accept.py` and `../cubic.py`; if a failure has the
+wrong reason, in `outcome.py`.
 """
 
 import numpy as np
@@ -27,16 +30,17 @@ from .outcome import level_counts, with_events, without_events
 from .state import Aim, Approach, Moved, Options, Recorded, State, Stride, Task
 
 
-# A guard's zero is aimed at if Newton's guess places it within this part of the step. Nearer to 1:
-# steps are spent on zeros that are not there. Nearer to 0: zeros are met without being aimed at.
+# A step aims at the zero of a guard if Newton's guess of the zero lies within this part of the
+# step. Nearer to 1: steps are spent on zeros that are not there. Nearer to 0: zeros are met without
+# being aimed at.
 _AIM_WITHIN = 0.7
-# The first step, as a part of the time in which the state changes by its size (for errors of 1e-2;
-# the default method has order 7), and at most as a part of the time allowed. Higher: first steps
-# are rejected. Lower: steps are taken until they have grown.
+# The first step, as a part of the time in which the state changes by its own magnitude, and at most
+# this part of the time allowed. (For errors of 1e-2; the default method has order 7.) Higher: first
+# steps are rejected. Lower: many short steps at the beginning.
 _FIRST_STEP = 0.1
-# Where sizes of states are not known, a state that begins near zero changes by its own size at
-# once: the first step is no shorter than this part of the time allowed. Higher: stiff systems
-# reject it. Lower: more steps until they have grown.
+# The shortest first step, as a part of the time allowed, if magnitudes of states are not known: a
+# state that begins near zero changes by its own magnitude at once. Higher: stiff systems reject the
+# step. Lower: more short steps at the beginning.
 _SHORTEST = 1e-6
 
 
@@ -50,9 +54,10 @@ def search(
     result: Index,
     options: Options,
 ) -> Recorded:
-    """Flow every lane to its target, or to a result code for the reason of its failure.
+    """Flow every lane to its target. A lane that fails stays where it failed, and has a result
+    code.
 
-    Lanes whose `result` is not OK at the start stay there.
+    Lanes whose `result` is not OK at the start do not move.
     """
     task = Task(
         s, u, target, target.limit - lanes.t, stride, settings, options.tangents
@@ -73,7 +78,8 @@ def search(
         return end, None if tape is None else write_row(tape, state.i, row)
 
     end, written = while_loop(going, iterate, (begin, tape))
-    # (Copies of many empty rows take time. A single lane's tape has as many as XLA's.)
+    # (Empty rows are cut off, since copying them takes time. The tape of a single lane keeps the
+    # length that it has in XLA.)
     if written is not None and on_host(end.i) and s.by_system:
         written = Tape(*(x[: end.i] for x in written))
     result = update_result(end.result, end.active, Result.STEP_LIMIT)
@@ -115,19 +121,19 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
 
 
 def take_aim(state: State, task: Task) -> Aim:
-    """The steps of active lanes; steps of length 0 of all others."""
+    """The steps that lanes attempt next. Lanes that are not active have steps of length 0."""
     approach = state.approach
     xp = namespace(state.lanes.t)
     due, schedule, at_once = _known_time(state, task)
     # The step is cut so that it ends on known times exactly, in equal pieces.
     left = xp.maximum(due - state.lanes.t, 0.0)
-    # (A flow of no duration has a first step of none.)
+    # (In a flow of no duration, the first step is zero.)
     h = xp.where(left > 0, state.h, 1.0)
     pieces = xp.ceil(xp.where(xp.isfinite(left), left / h, 2.0) - SAME_TIME)
     last = (pieces <= 1) & ~approach.on
     step = xp.where(xp.isfinite(left), left / xp.maximum(pieces, 1.0), state.h)
     which = xp.where(approach.on, approach.which, -1)
-    # A zero that Newton's guess places within the first step is aimed at.
+    # The first step aims at a zero if Newton's guess of it lies within the step.
     guess = _expected_zeros(state, task, step, at_once)
     nearest = xp.min(guess, axis=0)
     lands = xp.isfinite(nearest)
@@ -148,8 +154,8 @@ def take_aim(state: State, task: Task) -> Aim:
 
 
 def _known_time(state: State, task: Task) -> tuple[Times, Index, Mask]:
-    """The next known time, the transition that is due there (-1: none), and whether it is due at
-    once, since a reset has put its guard beyond zero."""
+    """The next known time, the transition that is due at this time (-1: none), and whether it is
+    due at once because a reset has put its guard below zero."""
     s = task.s
     lanes = state.lanes
     target = task.target
@@ -169,8 +175,9 @@ def _known_time(state: State, task: Task) -> tuple[Times, Index, Mask]:
 def _expected_zeros(
     state: State, task: Task, step: Times, at_once: Mask
 ) -> Float[Array, "W L"]:
-    """Newton's guesses of the times to zeros of watched functions within the first `step`, where
-    the way is known; infinity for all others."""
+    """Newton's guesses of the times to zeros of watched functions, if they lie within `step`; else
+    infinity. They are used if the caller has set `Stride.lead` (a factor that corrects the guess at
+    the start); those of guards, only in the first step after the start or after an event."""
     approach = state.approach
     xp = namespace(step)
     value, rate = state.watched

@@ -1,4 +1,11 @@
-"""The state of a search: constants of a task, the state of the iteration, an attempted step."""
+"""The data that the files of `search/` hand to each other; nothing is computed here.
+
+`Task` has the constants of a search. `State` is the state of its iteration, `Aim` the step that is
+to be attempted, and `Attempt` the step that was computed. `Options`, `Stride`, `Moved` and
+`Recorded` are what callers of `move` give and get. Each array has lanes (trajectories side by side)
+on its last axis. A *watched function* is a guard, or the level function of the target section; its
+zeros end steps.
+"""
 
 from typing import NamedTuple
 
@@ -15,17 +22,18 @@ from ..watch import Watch
 
 
 class Stride(NamedTuple):
-    """Knowledge of the way, before lanes set out."""
+    """What a caller knows of the way before the flow begins."""
 
     h: Times
     """The first step."""
     lead: Times
-    """Expected time to the target's level as a multiple of Newton's guess at the start; 0 if it is
-    not known."""
+    """Expected time until the target's level is zero, as a multiple of Newton's guess at the start;
+    0 if it is not known."""
     slack: Times
     """A step's error estimate may be this many times the tolerance."""
     along: Padded | None = None
-    """Deviations that began before (see `State`). Default: they begin with the flow."""
+    """Deviations that began before this flow (see `State.along`). Default: deviations begin with
+    the flow."""
 
 
 class Options(NamedTuple):
@@ -85,9 +93,10 @@ class Approach(NamedTuple):
     tau: Times
     """Expected time from the lane's time to the crossing."""
     reach: Times
-    """Length of the step in which it was met."""
+    """Length of the step in which the crossing was met."""
     rate: Times
-    """The largest rate of that function at the ends of that step."""
+    """The largest rate of the watched function at the ends of the step in which the crossing was
+    met."""
     tries: Index
 
 
@@ -98,7 +107,7 @@ class State(NamedTuple):
     watched: Watch
     """The watched functions at the lanes."""
     aimed: Mask
-    """Whether the target's level would end the flow at its next falling zero."""
+    """Whether the next fall of the target's level through zero ends the flow."""
     approach: Approach
     h: Times
     """The next step, if no event comes in between."""
@@ -127,7 +136,7 @@ class Aim(NamedTuple):
     """The step that lanes attempt."""
 
     which: Index
-    """The watched function on whose zero they are to land; -1 for none."""
+    """The watched function whose zero is the end of the step; -1 for none."""
     step: Times
     """Length of the step."""
     reach: Times
@@ -139,32 +148,32 @@ class Aim(NamedTuple):
     last: Mask
     """Whether this step ends at the known time."""
     at_once: Mask
-    """Whether `schedule` is no scheduled transition, but one whose guard is beyond zero: the step
-    has no length."""
+    """Whether `schedule` is a transition whose guard is below zero, instead of a scheduled one: it
+    happens at once, and the step has no length."""
 
 
 class Attempt(NamedTuple):
     """A step of every lane, before it is accepted."""
 
     q: Padded
-    """The state at its end: on the zero that the lane aims at, if it lands."""
+    """The state at the end of the step; if the lane lands, at the zero at which it aims."""
     watched: Watch
-    """The watched functions there."""
+    """The watched functions at the end."""
     margin: Float[Array, "W L"]
     """How far watched functions may be from their cubic interpolants over the step."""
     error: Times
     """Estimate of the step's error, relative to the tolerance."""
     past: Times
-    """Time from the end of the step aimed for to the zero, as far as is known."""
+    """Estimated time from the end of the step that was aimed for to the zero."""
     lands: Mask
     slow: Mask
     """The zero on which the lane lands is not crossed in falling, or at a vanishing speed."""
     bent: Mask
     """A watched function is not resolved by its cubic interpolant over the step.
 
-    Step control looks at the states only; where those are simple, a guard may still turn many
-    times within a step."""
+    The error estimate of a step is that of the states only. Where states change smoothly, a guard
+    may still turn many times within a step."""
     along: Float[Array, "d L"] | None
-    """See `State`."""
+    """The deviation at the end of the step (see `State.along`)."""
     calm: Mask
-    """No watched function comes near to a zero, save that on which the lane lands."""
+    """No watched function comes near zero, except for the one on whose zero the lane lands."""

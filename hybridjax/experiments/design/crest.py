@@ -1,4 +1,8 @@
-"""Phases for low crest factors."""
+"""Phases of multisines that give low crest factors (largest value over rms value).
+
+`Design.optimize_phases` calls `low_peak_phases`, which minimizes p-norms of each signal over its
+phases, for growing p.
+"""
 
 from typing import Any
 
@@ -9,8 +13,8 @@ from ...errors import DefinitionError
 from .partition import is_real
 
 
-# Powers p of the norms that approach the peak; for 2048 samples the last norm is within 6 % of it
-# (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
+# Powers p of the norms, which approach the peak. For 2048 samples the last norm is within 6 % of
+# the peak (the bound is 2048^(1/128)). A larger first power leads to poorer minima.
 _POWERS = (4, 8, 16, 32, 64, 128)
 # Steps of the minimization at each power. Fewer: higher crest factors. Twice as many: hardly lower
 # ones, in twice the time.

@@ -1,4 +1,10 @@
-"""Multisine designs: which cosines, with which phases, in which experiment."""
+"""`Design`: which cosines, with which amplitudes and phases, in which experiment.
+
+`multisine`, `paper_design` and `hj.designs` make designs, and `run_experiments` and `estimate_htf`
+use them. A *line* is the integer j of a frequency j / P in cycles per period, with P the number of
+periods of an experiment. `check` has the rules under which HTFs can be estimated; the arithmetic of
+lines is in `partition.py`.
+"""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -36,8 +42,8 @@ InputNames = Count | SignalNames
 # Cycles that are discarded by default after a start on the limit cycle, as in the paper. Fewer: the
 # transient biases estimates. More: strides are wasted.
 DISCARD = 20
-# Frequencies and edges of a band may miss multiples of 1/P by this, in lines. Smaller: rounding of
-# f is refused. Larger: a wrong frequency is moved without an error.
+# Frequencies and edges of a band may differ from multiples of 1/P by this part of 1/P. Smaller:
+# rounding errors of f are refused. Larger: a wrong frequency is moved without an error.
 OFF_LINE = 1e-6
 
 
@@ -317,10 +323,10 @@ class Design(Showable, eqx.Module):
         rng = np.random.default_rng(seed)
         pair = self.line * len(self.inputs) + self.channel
         pairs, place = np.unique(pair, return_inverse=True)
-        turns = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
+        angles = rng.uniform(0, 2 * np.pi, (count, len(pairs)))
         real = is_real(pairs // len(self.inputs), self.periods, self.n_sections)
-        turns = np.where(real, np.pi * (turns > np.pi), turns)
-        phase = (self.phase + turns[:, place]) % (2 * np.pi)
+        angles = np.where(real, np.pi * (angles > np.pi), angles)
+        phase = (self.phase + angles[:, place]) % (2 * np.pi)
         shift = np.arange(count)[:, None] * self.experiments
         return self._times(count, phase, self.experiment + shift)
 
@@ -350,7 +356,8 @@ class Design(Showable, eqx.Module):
         return self._times(2, phase, 2 * self.experiment + np.array([[0], [1]]))
 
     def _times(self, count: int, phase, experiment) -> "Design":
-        """Return the cosines repeated, with other phases, in other experiments."""
+        """Return the design with its cosines repeated `count` times, with the given phases and
+        experiments."""
         same = [np.tile(x, count) for x in (self.line, self.channel, self.amplitude)]
         cosines = [experiment.ravel(), *same, phase.ravel()]
         experiments = count * self.experiments
@@ -438,8 +445,8 @@ def _count(number: int | str, noun: str) -> str:
 def require_inputs(
     design: Design, other: str, n_sections: int, inputs: tuple[str, ...]
 ) -> None:
-    """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or a name
-    of one input is that of another one there."""
+    """**Raises:** `DefinitionError` if sections or inputs differ from those of a system, or if the
+    inputs have the same names in another order."""
     what = f"design and {other}"
     names = design.inputs
     require_equal(what, "n_sections", design.n_sections, n_sections)

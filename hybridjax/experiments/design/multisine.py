@@ -1,4 +1,9 @@
-"""Multisines over a band, and the paper's design."""
+"""Multisines that measure all frequencies of a band (`multisine`), and the design of the paper
+(`paper_design`).
+
+Both divide the lines of a band among experiments (`partition.py`), give them random phases, and
+return a `Design`. A *line* is the integer j of a frequency j / P in cycles per period.
+"""
 
 from collections.abc import Callable
 from typing import Literal
@@ -197,7 +202,8 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
 
 
 def _orthogonal(division, j, phase):
-    """Return every set of lines in nu experiments, with phases that turn from one to the next."""
+    """Return every set of lines in nu experiments. From one of these to the next, phases of the
+    inputs change by multiples of 2 pi / nu, which separates the responses to the inputs."""
     nu, K = phase.shape
     block, k, channel = np.indices((nu, K, nu)).reshape(3, -1)
     turned = phase[channel, k] + 2 * np.pi / nu * block * channel

@@ -1,14 +1,19 @@
-"""Which cosines may share an experiment, and how few experiments suffice.
+"""Which cosines may share an experiment, and how few experiments suffice. Called by `multisine.py`,
+`design.py` and estimates of HTFs.
 
-A cosine at the frequency `f` (cycles per period) makes a periodic system of N sections answer at
-`f + l` and, through its negative half, at `-f + l` for all integers l. So (Ankarali & Cowan,
-Sec. V-B) two cosines may share an experiment unless their difference or their sum is an integer.
-On the grid `f = j / P` that is one comparison: with `r = j mod P`, the *class* of a line is
-`min(r, P - r)`, and two lines disturb each other exactly if their classes are equal.
-Lines of one class need one experiment each, lines of different classes never meet; so the size
-of the largest class is the exact minimum of experiments, and every greater number works too.
+A cosine at the frequency `f` (cycles per period) makes a periodic system of N sections answer at `f
++ l` and, through its negative half, at `-f + l` for all integers l. So two cosines may share an
+experiment unless the difference or the sum of their frequencies is an integer (Ankarali & Cowan,
+Sec. V-B).
 
-Lines are integers `j` here: `f = j / P`, angle per section `2 pi j / (N P)`.
+A *line* is an integer `j`; its frequency is `f = j / P`, and its angle per section `2 pi j / (N
+P)`. With `r = j mod P`, the *class* of a line is `min(r, P - r)`. Two lines disturb each other
+exactly if their classes are equal. Lines of one class need one experiment each, and lines of
+different classes never disturb each other. So the size of the largest class is the smallest
+possible number of experiments, and every greater number works, too.
+
+`assign` makes a random division of lines that obeys this rule, and `avoid_second_order` also avoids
+the frequencies of second-order distortion.
 """
 
 import itertools
@@ -21,18 +26,18 @@ from jaxtyping import Bool, Complex, Int
 from ...errors import DefinitionError
 
 
-# Normal equations are singular if, with unknowns scaled to magnitude 1, the least eigenvalue is
-# below this, or if one magnitude is below this part of another; so are two phases of a line whose
-# mean of exp(2i phase) is this close to 1, and a cosine at 0 or N/2 with this part of its power.
-# Smaller: inputs that only rounding separates are accepted. Larger: good experiments with unequal
-# inputs are refused.
+# Normal equations are singular if, with unknowns scaled to magnitude 1, their least eigenvalue is
+# below this, or if one magnitude is below this part of another. The same number is used for two
+# phases of a line, which are singular if the mean of exp(2i phase) is this close to 1; and for a
+# cosine at 0 or N/2, which is singular if only this part of its power is left. Smaller: inputs that
+# only rounding separates are accepted. Larger: good experiments with unequal inputs are refused.
 SINGULAR = 1e-6
-# Rounds of simulated annealing. Fewer: divisions are missed that there are. More: vain searches
-# last.
+# Largest number of rounds of simulated annealing. Fewer: existing divisions are not found. More:
+# vain searches last longer.
 _ROUNDS = 200_000
-# Rounds whose random numbers are drawn at once, after which the list of disturbed experiments is
-# made again. Fewer: searches last longer. More: the list holds more experiments without a product
-# on a line.
+# Number of rounds whose random numbers are drawn at once. Then the list of disturbed experiments is
+# renewed. Fewer: searches last longer. More: the list contains more experiments that are not
+# disturbed any more.
 _DRAWS = 4096
 
 
@@ -64,7 +69,8 @@ def needs_two_phases(
 
 
 def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
-    """Return whether normal equations can be solved, for unknowns of any magnitude."""
+    """Return whether normal equations can be solved, whatever the magnitudes of the unknowns
+    are."""
     size = np.sqrt(np.einsum("kii->ki", gram).real)
     largest = size.max(axis=0, initial=0)
     relative = size / np.maximum(largest, np.finfo(float).tiny)
@@ -76,7 +82,8 @@ def regular(gram: Complex[np.ndarray, "k n n"]) -> Bool[np.ndarray, " k"]:
 
 
 def fewest_experiments(line: Int[np.ndarray, " K"], periods: int) -> int:
-    """Return the exact minimum of experiments for these lines, repeated ones counted each time."""
+    """Return the smallest possible number of experiments for these lines. (A repeated line counts
+    each time.)"""
     return int(np.bincount(line_class(line, periods)).max())
 
 
@@ -162,7 +169,7 @@ def _anneal(division: "_Division", rng: np.random.Generator) -> None:
 
 
 class _Swap(NamedTuple):
-    """An exchange of line i of one experiment for line j of another one."""
+    """The exchange of line i of one experiment with line j of another one."""
 
     first: int
     i: int
@@ -177,8 +184,8 @@ class _Swap(NamedTuple):
 
 
 class _Division:
-    """A division of lines among experiments: by experiment, the numbers of its lines, their
-    classes, and how many second-order products fall on one of them."""
+    """A division of lines among experiments. For each experiment, it has the numbers and classes of
+    its lines, and how many second-order products fall on one of these lines."""
 
     def __init__(
         self,
@@ -238,7 +245,7 @@ class _Division:
 
 
 def _products(periods: int) -> list[list[int]]:
-    """Return for each pair of classes a bit mask of the classes of its second-order products."""
+    """Return, for each pair of classes, the classes of its second-order products as a bit mask."""
     top = periods // 2 + 1
 
     def fold(x):
@@ -254,7 +261,7 @@ def _products(periods: int) -> list[list[int]]:
 
 
 def _hits(classes: list[int], products: list[list[int]]) -> int:
-    """Return the number of second-order products of some classes that fall on one of them."""
+    """Return how many second-order products of lines of these classes fall on one of the lines."""
     mask = sum(1 << c for c in classes)  # (an experiment has each class once)
     pairs = itertools.combinations_with_replacement(classes, 2)
     return sum((products[a][b] & mask).bit_count() for a, b in pairs)
@@ -293,7 +300,7 @@ def check_sharing(
 
 
 def _reason(low: int, high: int, periods: int) -> str:
-    """Return how two lines of one class disturb each other."""
+    """Return a phrase for an error: how two lines of one class disturb each other."""
     f = low / periods
     g = high / periods
     if low == high:

@@ -1,4 +1,7 @@
-"""Inputs as a table, for hardware that plays one."""
+"""Inputs of experiments as a CSV table, for hardware that plays it.
+
+`Design.write` calls `write_table`. `recordings/design_tables.py` reads such a table again.
+"""
 
 import csv
 from pathlib import Path

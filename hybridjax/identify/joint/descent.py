@@ -1,7 +1,10 @@
-"""The descent of a periodic model: Gauss-Newton steps, shortened as Levenberg and Marquardt do.
+"""The descent of a periodic model to the nearest minimum: Gauss-Newton steps with
+Levenberg-Marquardt damping.
 
-It is not left to a library, since a step changes the problem: the local coordinates are those of
-the last model, and the weights of time series those of its errors.
+`joint/fit.py` calls `descend` with a `ModelPoint` (a model and its least-squares problem), and gets
+the last point and whether it is a minimum. The descent is not left to a library because each step
+changes the problem: local coordinates are those of the last model, and the weights of time series
+are those of its errors. A fit that ends too early has its cause in `settled` or `stalled`.
 """
 
 from contextlib import suppress
@@ -26,22 +29,25 @@ Problem = FrequencyProblem | SeriesProblem
 # The first damping, relative to the squared length of each column. Larger: short steps; smaller:
 # several attempts until a step lowers the cost.
 _FIRST_DAMPING = 1e-4
-# Factors of the damping: the smallest after a step that lowers the cost (Nielsen 1999), and the
-# first after a step that fails. Closer to 1: more attempts; farther: steps too long or short.
+# Factors of the damping: `_LESS` is the smallest after a step that lowers the cost (Nielsen 1999),
+# and the other one the first after a step that fails. Closer to 1: more attempts. Farther: steps
+# are too long or too short.
 _LESS = 0.1
 _MORE = 4.0
-# Largest damping: steps are then below 1e-8 of the full one. Larger: attempts below rounding;
-# smaller: descents stop in narrow valleys.
+# Largest damping, with which steps are below 1e-8 of the full step. Larger: steps are rounding
+# errors. Smaller: descents stop in narrow valleys.
 _MOST_DAMPING = 1e8
-# Expected decrease of the cost at the minimum, for each unknown, in units of the errors' variance.
-# Larger: rms errors grow, by 0.5 % for 2e-2; smaller: steps without effect.
+# A point is a minimum if the expected decrease of the cost, per unknown and in units of the errors'
+# variance, is below this. Larger: rms errors grow (by 0.5 % for 2e-2). Smaller: steps without
+# effect.
 _SETTLED_GAIN = 1e-2
-# Expected squared change of the characteristic polynomial's coefficients there, in units of their
-# variance. Larger: multipliers miss the minimum, at 1e-3 by 3 % of their standard errors.
+# In addition, the expected squared change of the coefficients of the characteristic polynomial, in
+# units of their variance, must be below this. Larger: multipliers miss the minimum (at 1e-3, by 3 %
+# of their standard errors).
 _SETTLED_SHIFT = 1e-3
-# If no step lowers the cost: the gain, relative to the cost, or the largest entry of the step, that
-# rounding explains (slow states multiply it by up to 1e6). Larger: stalled descents count as
-# converged; smaller: minima of exact data do not.
+# If no step lowers the cost, the descent has converged up to rounding if the expected relative
+# gain, or the largest entry of the step, is below these numbers. (Slow states amplify rounding by
+# up to 1e6.) Larger: stalled descents count as converged. Smaller: minima of exact data do not.
 _STALLED_GAIN = 1e-10
 _STALLED_STEP = 1e-8
 
@@ -53,7 +59,7 @@ class ModelPoint:
         self.problem = problem
         self.direct = direct
         self.model = model
-        # A resonant model stays as it is; one that overflows has no finite cost.
+        # A resonant model is not refined. A model that overflows has no finite cost.
         with suppress(np.linalg.LinAlgError), np.errstate(all="ignore"):
             self.model = model.refined(direct, problem.linearize)
         self.cost = problem.cost(self.model)
@@ -72,9 +78,10 @@ class ModelPoint:
     def reweighted(self) -> "ModelPoint":
         """Return the point with new weights.
 
-        The log determinant of the errors' covariance is concave, so that a step that lowers the
-        cost with the old weights raises the likelihood, where no sample is missing. With gaps the
-        covariance is that of the pairs that are sampled, which is nearly the likelihood's.
+        The log determinant of the errors' covariance is concave. If no sample is missing, a step
+        that lowers the cost with the old weights therefore raises the likelihood. With gaps, the
+        covariance is computed from the pairs of outputs that are sampled together, which is nearly
+        the same.
         """
         if isinstance(self.problem, SeriesProblem):
             self.problem = self.problem.reweighted(self.model)

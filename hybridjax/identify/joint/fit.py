@@ -1,10 +1,10 @@
-"""Maximum likelihood for the matrices of a linear periodic model.
+"""`fit_ldtp`: maximum likelihood for the matrices of a linear periodic model.
 
 `_fit_to_htf` and `_fit_to_records` take the same stages: a first model (`realization.py`, or
 `series/subspace.py`), the descent to the nearest minimum (`descent.py`), the fit with its
 covariance (`_finished`), and doubts about it. For records, it is also decided whether outputs
 depend on the input at their own section (D). The descent finds the minimum nearest to the first
-model: to see whether a poor fit has a better one, give a model that is known as `initial`.
+model: if a fit is poor, give a known model as `initial` to see whether there is a better minimum.
 """
 
 import dataclasses
@@ -66,9 +66,10 @@ from .realization import realized_htf
 Dimensions = Order | Annotated[Numbers, Integers("sections", sign="positive")]
 Guess = LDTP | Dimensions
 
-# Least decrease of the cost by the inputs, for each unknown, in units of the errors' variance (1 if
-# errors are white and nothing answers). Smaller: multipliers of noise that is filtered by the
-# system, which looks like a response. Larger: weak responses are refused.
+# The inputs must decrease the cost by at least this for each unknown, in units of the errors'
+# variance. (It is 1 if errors are white and outputs do not respond.) Smaller: noise that is
+# filtered by the system looks like a response, and gives multipliers. Larger: weak responses are
+# refused.
 _ANSWERED = 5.0
 
 
@@ -457,7 +458,7 @@ def _doubts(
         return unknown
     if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
-    # (References do not respond to outputs, at no section.)
+    # (References never respond to outputs.)
     direct = fit._coordinates.direct or outside is not records
     return residuals.about_misfit(outside.whole(), grid, error, how.innovations, direct)
 
@@ -473,7 +474,7 @@ def _likelier(records: PreparedRecords, guess: Guess, how: _How) -> LDTPFit:
     for start in (guess, without):  # (may differ in minima)
         zero = _fit_to_series(records, start, how, False)
         rise = samples @ (_error_sizes(zero) - _error_sizes(fit))
-        # (At 5 %: a D that is fitted in vain enlarges errors a little, a missing one is a bias.)
+        # (At 5 %: a D that is not needed enlarges errors a little, but a missing D is a bias.)
         p = _probability(float(rise), fit.unknowns - zero.unknowns)
         if zero.result == Result.OK and p > 0.05:
             return zero
@@ -486,7 +487,7 @@ def _error_sizes(fit: LDTPFit) -> Float[np.ndarray, " N"]:
 
 
 def _probability(rise: float, unknowns: int) -> float:
-    """Return the probability that so many unknowns which are zero lower the cost by as much."""
+    """Return the probability that unknowns whose true values are zero lower the cost by as much."""
     return float(special.gammaincc(unknowns / 2, max(rise, 0.0) / 2))
 
 
@@ -496,7 +497,8 @@ def _fit_to_series(
     how: _How,
     direct: bool | None,
 ) -> LDTPFit:
-    """Return a fit with D, with D = 0, or (None) with D = 0 if the data do not contradict it."""
+    """Return a fit with D, or with D = 0. If this is not decided (None): with D = 0 unless the data
+    contradict it."""
     if direct is None:
         return _likelier(records, cast(Guess, guess), how)
     if records.lead:
@@ -587,7 +589,8 @@ def _freedom_of(
 
 
 def _require_answer(point: ModelPoint) -> None:
-    """**Raises:** `DefinitionError` if the inputs explain no more than unknowns do of noise."""
+    """**Raises:** `DefinitionError` if the inputs explain no more of the outputs than the same
+    number of unknowns explains of noise."""
     matrices_of_inputs = (point.model.B, point.model.D)
     B, D = ([0.0 * x for x in matrices] for matrices in matrices_of_inputs)
     explained = point.problem.cost(point.model._replace(B=B, D=D)) - point.cost
@@ -601,7 +604,7 @@ def _require_answer(point: ModelPoint) -> None:
 def _surplus(
     fit: LDTPFit, point: ModelPoint, smaller: Callable[[Sequence[int]], PeriodicModel]
 ) -> list[Finding]:
-    """Return a finding if a model with one dimension less at each section is nearly as good, or
+    """Return a finding if a model with one dimension less at each section is nearly as good, or if
     the data do not determine the multipliers.
 
     **Arguments:** `smaller`: a first model with these dimensions.
@@ -612,7 +615,7 @@ def _surplus(
         return unknown
     with suppress(DefinitionError):
         start = ModelPoint(point.problem, smaller(dims), point.direct)
-        # (Ten steps are enough to come near.)
+        # (Ten steps lead near the minimum.)
         fewer, _ = descend(start, max_steps=10)
         unit = 1.0 if np.isinf(fit.covariance_dof) else point.cost / fit.dof
         rise = (point.problem.cost(fewer.model) - point.cost) / unit
@@ -630,7 +633,7 @@ def _with_findings(fit: LDTPFit, more: Sequence[Finding]) -> LDTPFit:
 
 
 def _about_point(fit: LDTPFit) -> tuple[Finding, ...]:
-    """Return what the end of the descent alone says about a fit."""
+    """Return the findings that follow from the end of the descent alone."""
     findings = not_converged(fit.result)
     alike = weights.are_alike(fit.correlation or 0.0, fit.dof)
     if fit.cost > 2 * fit.dof or alike:
@@ -657,7 +660,8 @@ def _finished(
     scale: Float[np.ndarray, " ny"],
     dof: int,
 ) -> LDTPFit:
-    """Return the fit at a minimum, with the outputs in their own units, which are `scale`."""
+    """Return the fit at a minimum, with the outputs in their own units. `scale`: units of the
+    outputs in the problem."""
     model = point.coordinates.model
     unit = point.cost / dof
     known = False

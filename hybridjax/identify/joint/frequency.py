@@ -11,8 +11,11 @@ A change of the matrices at section n alone changes $H_m$ by
 $$\delta H_m = \frac{1}{N} e^{-2 \pi i m n / N} \left( \nu_m[n] (\delta A\,\tilde x[n] + \delta B)
 + \delta C\,\tilde x[n] + \delta D \right),$$
 
-with $\nu_m[n] = z_m^{-1} \mu_m[n+1]$, $z_m = z e^{2 \pi i m / N}$ and the adjoint
-$\mu_m[n] = C[n] + z_m^{-1} \mu_m[n+1] A[n]$.
+with $\nu_m[n] = z_m^{-1} \mu_m[n+1]$, $z_m = z e^{2 \pi i m / N}$ and the adjoint $\mu_m[n] = C[n]
++ z_m^{-1} \mu_m[n+1] A[n]$.
+
+`fit_ldtp` calls `FrequencyProblem` for costs and linearized equations; designs and bounds call
+`transfer` and `transfer_slopes`. If a derivative is wrong, compare `_fill` with the second formula.
 """
 
 from collections.abc import Iterator
@@ -26,7 +29,8 @@ from ..descent import NormalEquations
 from ..periodic import LocalCoordinates, PeriodicModel
 
 
-# Numbers of a Jacobian that are held at once, 32 MB. Larger: memory; smaller: loops in Python.
+# Number of entries of a Jacobian in memory at once (32 MB). Larger: memory. Smaller: loops in
+# Python.
 _HELD = 2**21
 
 
@@ -37,7 +41,7 @@ class FrequencyProblem(NamedTuple):
     harmonics: tuple[int, ...]
     target: Complex[np.ndarray, "M F ny nu"]
     weight: Float[np.ndarray, "M F ny nu"]
-    """One over the standard deviation of real and imaginary part."""
+    """The inverse of the standard deviation of real and imaginary part."""
 
     @classmethod
     def of(
@@ -120,7 +124,8 @@ def transfer_slopes(
     if weight is None:
         entries = model.D[0].shape
         weight = np.ones((len(m), len(f), *entries))
-    # Derivatives by later states are those of the transposed system, in the other order.
+    # Derivatives by later states are states of the transposed system, with the sections in reverse
+    # order.
     dual = model._replace(
         A=[A.T for A in model.A[::-1]], B=[C.T for C in model.C[::-1]]
     )
@@ -159,7 +164,7 @@ def _fill(
 ) -> None:
     """Write the derivatives by the blocks of section n, each (rows, columns, M, F, ny, nu).
 
-    **Arguments:** `after`: derivatives of the HTFs by the next state, less `waves`.
+    **Arguments:** `after`: derivatives of the HTFs by the next state, without the factor `waves`.
     """
     model = coordinates.model
     wave = waves[:, None, None]

@@ -5,6 +5,9 @@ to the inputs in these sections. The latter is projected out, and $O_n$ is the r
 remainder (subspace identification from frequency responses, McKelvey, Akcay and Ljung 1996, at each
 section; Uyanik et al. 2019 treat periodic systems by lifting). Given A and C, B and D are a linear
 least-squares problem.
+
+`fit_ldtp` calls `realized_htf` for its first model. If this has the wrong dimensions, look at the
+level of noise there.
 """
 
 from collections.abc import Sequence
@@ -66,7 +69,7 @@ def realized_htf(
         weight = np.broadcast_to(1 / scale[:, None], (F, ny, nu))
         edge = 0.0
     else:
-        # Real and imaginary part have half of the variance each.
+        # Real and imaginary part each have half of the variance.
         spread = np.sqrt(np.asarray(htf.variance).sum(axis=0) / 2)
         scale = positive(np.sqrt((spread**2).mean(axis=(0, 2))))
         smallest = SMALLEST_ERROR * np.abs(responses).max()
@@ -101,10 +104,10 @@ def _without_later_inputs(
     f: Float[np.ndarray, " F"],
     p: int,
 ) -> Matrices:
-    """Return, for each section, the outputs there and at the p sections after it, of all
+    """Return, for each section, the outputs at this section and the p sections after it, at all
     frequencies, without their responses to the inputs at these sections."""
     N, F, ny, nu = responses.shape
-    # One weight for each column, that of its noise, keeps the rows of an input as they are.
+    # Each column has one weight (that of its noise), so that the rows of an input keep their form.
     column = np.sqrt(np.mean(weight**2, axis=1)).T.ravel()  # (nu F)
     delay = np.exp(2j * np.pi / N * f)
     powers = delay ** np.arange(p + 1)[:, None]

@@ -1,10 +1,11 @@
-"""Multipliers by one regression of outputs on those of earlier cycles, without iteration.
+"""Multipliers by one regression of outputs on the outputs of earlier cycles, without iteration.
 
 By the theorem of Cayley and Hamilton, outputs of successive cycles at one section, less what inputs
-explain, obey the characteristic polynomial of the multipliers. `late_outputs` sums the products of
-outputs 0, 1, ..., d cycles earlier over all sections and records. `total_least_squares` has no bias
-by white noise: from it, `fit_series` and the choice of an order start. `ordinary_least_squares` is
-biased to zero, and only compared with fits.
+explain, obey the characteristic polynomial of the multipliers: a sum of the outputs of d + 1
+successive cycles, weighted by its coefficients, is zero up to noise. `late_outputs` sums the
+products of outputs 0, 1, ..., d cycles earlier over all sections and records. `total_least_squares`
+has no bias by white noise: `fit_series` and the choice of an order start from its result.
+`ordinary_least_squares` is biased to zero; it serves only as a comparison.
 """
 
 from typing import NamedTuple
@@ -23,10 +24,10 @@ class DelayedOutputs(NamedTuple):
     """The outputs 0, 1, ..., d cycles earlier, without the part that inputs explain."""
 
     gram: Float[np.ndarray, "ny d1 d1"]
-    """Their Gram matrix, for each output."""
+    """Gram matrix of these outputs, for each output signal."""
     dof: int
-    """The number of independent rows of all outputs: noise of variance 1 makes the sum of the Gram
-    matrices that large."""
+    """Number of independent rows of all outputs, which is the expected sum of the Gram matrices for
+    noise of variance 1."""
 
 
 def late_outputs(problem: OutputErrorProblem, order: int) -> DelayedOutputs:

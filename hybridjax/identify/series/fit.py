@@ -1,10 +1,12 @@
-"""Multipliers and transfer functions from recorded time series with any input: output error.
+"""`fit_series`: multipliers and transfer functions from recorded time series with any input (output
+error).
 
 `_fit_open_loop` takes the stages in order: a first c by regression (`delayed_outputs.py`), the
 minimum of the output error (`linearization.minimize`), a second minimum with outputs in units of
-their noise, the covariance of c from blocks of cycles (`_uncertainty`), and doubts about order,
-drift and feedback. With references, `in_loop.py` takes the place of the first four. A wrong
-multiplier comes from the minimum, a wrong error bar from `block_scores`.
+their noise, the covariance of c from blocks of cycles (`_uncertainty`), and findings about order,
+drift and feedback. (c are the coefficients of the denominator chi.) With references, `in_loop.py`
+takes the place of the first four. A wrong multiplier has its cause in the minimum, a wrong error
+bar in `block_scores`.
 """
 
 import dataclasses
@@ -90,7 +92,7 @@ from .residuals import about_answers
 
 
 _BIASED = "the fit is biased; name their `references`"
-# Level at which multipliers that change along the data are reported. Larger: chance is. Smaller:
+# Level of the test whether multipliers change along the data. Larger: chance is reported. Smaller:
 # changes of a few standard errors pass.
 _STEADY = 0.01
 _CHANGES = Finding(
@@ -244,7 +246,7 @@ class SeriesFit(MultiplierFit):
         N, R, ny, _ = self.numerators.shape
         T = grid.u.shape[1]
         v = divide_by_chi(self.coefficients, grid.u)
-        # As in the fit, earlier inputs act on so many cycles without a model.
+        # As in the fit, the effect of earlier inputs on these first cycles is free.
         free = min(self.free_cycles, T) if free_start else 0
         no_drift = grid.drift[:, :, :0]
         out = np.zeros(grid.y.shape)
@@ -346,7 +348,7 @@ def _fit_in_loop(
 
 
 class _Weighted(NamedTuple):
-    """A fit with the weights that its residuals suggest."""
+    """A fit with weights from its own residuals."""
 
     problem: OutputErrorProblem
     solution: Linearization
@@ -398,7 +400,8 @@ def _fit_open_loop(
     refuse([*surplus, *(answers or drift)])
     doubts = [*surplus, *drift]
     if not doubts:
-        # One more multiplier, or a pair. (Where outputs drift, these would be of the drift.)
+        # One more multiplier, or a pair. (If outputs drift, additional multipliers would be those
+        # of the drift.)
         higher = [
             cache(partial(_of_order, order + k, records, fit, free_start))
             for k in (1, 2)
@@ -415,11 +418,12 @@ def _about_drift(
 ) -> list[Finding]:
     """Return a finding if slow drift of the outputs may explain multipliers of a fit.
 
-    It does if outputs that may drift have other multipliers, or as little noise without the
-    multipliers that may be 1, which a constant resembles.
+    This is so if a fit in which outputs may drift has other multipliers; or if it has as little
+    noise without the multipliers that may be 1. (A multiplier of 1 looks like a constant.)
     """
 
-    # (It is refused where an input acts later than the records begin, or drift was declared.)
+    # (A fit with drift is refused if an input begins to act later than the records begin, or if
+    # drift was declared.)
     def slow() -> PreparedRecords:
         return PreparedRecords(with_drift(records.records))
 
@@ -464,8 +468,8 @@ def _of_order(
 def _problem_like(
     fit: SeriesFit, records: PreparedRecords, order: int, free_start: bool
 ) -> OutputErrorProblem:
-    """Return a problem in units of a fit's noise, with no more lags than the fit has, if possible:
-    without zero multipliers they are enough."""
+    """Return a problem in units of a fit's noise. It has no more lags than the fit, if possible.
+    (These are enough if there are no zero multipliers.)"""
     N, R = fit.numerators.shape[:2]
     beyond = R - 1 - fit.lead - order * N
     extra_lags = max(beyond, 0)
@@ -535,9 +539,9 @@ def _noise(solution: Linearization) -> Float[np.ndarray, " ny"]:
 def missing_cycles(
     problem: OutputErrorProblem, solution: Linearization, least: int
 ) -> int:
-    """Return how many more cycles would leave this number of degrees of freedom, about."""
+    """Return about how many more cycles are needed for this number of degrees of freedom."""
     n, i = np.unravel_index(np.argmin(solution.dof), solution.dof.shape)
-    # (More lags than samples would use up more of them.)
+    # (If `dof` is 0, there may be fewer samples than unknowns: `freedom_left` may be negative.)
     left = int(solution.dof[n, i]) or problem.freedom_left(int(n), int(i))
     return max(least - left, 0)
 
@@ -561,12 +565,13 @@ def _noise_ratios(
     return np.linalg.eigvalsh(gram) / rows, spread
 
 
-# Draws of pure noise from which the noise in the Jacobian is estimated, and draws of noise filtered
-# by the system. Fewer: standard errors scatter with the draws, by 3 % for 16; more: time.
+# Number of draws of white noise, from which the noise in the Jacobian is estimated; and number of
+# draws of noise filtered by the system. Fewer: standard errors scatter with the draws, by 3 % for
+# 16; more: time.
 _WHITE_DRAWS = 4
 _FILTERED_DRAWS = 16
-# Blocks beyond the number of coefficients from which changes in time are tested. Fewer: the test
-# sees nothing.
+# Changes in time are tested if there are at least this many blocks more than coefficients. Fewer:
+# the test has no power.
 _FEWEST_BLOCKS = 6
 
 
@@ -611,7 +616,7 @@ class _BlockSums(NamedTuple):
     score: Float[np.ndarray, "B C d"]
     """Products of errors and slopes in each block, for the outputs and for drawn noise."""
     expected: Float[np.ndarray, "B d d"]
-    """Their expected squares, for white noise of variance one."""
+    """Expected products of the scores, for white noise of variance one."""
     squares: Float[np.ndarray, "2 C"]
     """Sums of squares of the errors, and of the errors filtered backward by 1 / chi."""
     filtered: Float[np.ndarray, "d d"]
@@ -622,9 +627,10 @@ class BlockScores(NamedTuple):
     """The gradient at a minimum, as a sum over blocks of cycles."""
 
     scaled: Float[np.ndarray, "B d"]
-    """In units in which noise like that of the data makes the sum of their squares one."""
+    """Scores of the blocks, in units in which the expected sum of their squares is one, for noise
+    like that of the data."""
     share: Float[np.ndarray, "B d d"]
-    """Their expected squares for white noise."""
+    """Expected products of the scores for white noise."""
     root: Float[np.ndarray, "d d"]
     """A root of the expected covariance of the gradient."""
     time: Float[np.ndarray, " B"]
@@ -633,7 +639,7 @@ class BlockScores(NamedTuple):
     def covariance(self) -> Covariance:
         """Return the covariance of the gradient."""
         d = self.scaled.shape[1]
-        # Scores add up to zero at the minimum, which takes this part of the sum away.
+        # At the minimum, scores add up to zero, which reduces the sum of squares by this part.
         taken = np.einsum("bij,bji->", self.share, self.share) / d
         share = max(1 - taken, 0.5)
         square = self.scaled.T @ self.scaled / share
@@ -641,17 +647,17 @@ class BlockScores(NamedTuple):
         return Covariance(matrix, denominator.block_freedom(self.scaled, self.share))
 
     def trend(self) -> float:
-        """Return the p-value of coefficients that do not change linearly in time.
+        """Return the p-value of the hypothesis that coefficients do not change linearly in time.
 
-        A score test: if they change, scores of earlier and later blocks differ. Their sum, weighted
-        by the time, is compared with its squares (Hotelling's T; for constancy of parameters:
-        Nyblom, J. Amer. Stat. Assoc. 84, 1989).
+        A score test: if coefficients change, scores of earlier and later blocks differ. The test
+        statistic is the sum of the scores times the time of their block, relative to its covariance
+        (Hotelling's T; for constancy of parameters: Nyblom, J. Amer. Stat. Assoc. 84, 1989).
         """
         blocks, d = self.scaled.shape
         if blocks < d + _FEWEST_BLOCKS:
             return 1.0
         weight = np.trace(self.share, axis1=1, axis2=2)
-        # (Without the mean, errors of the fit itself do not count.)
+        # (Less the weighted mean, so that errors of the fit itself have no effect.)
         late = self.time - weight @ self.time / weight.sum()
         weighted = late[:, None] * self.scaled
         total = weighted.sum(axis=0)
@@ -665,16 +671,16 @@ class BlockScores(NamedTuple):
 def block_scores(
     problem: OutputErrorProblem, solution: Linearization, cycles: int
 ) -> BlockScores | None:
-    """Return the gradient at the minimum in blocks of at least so many cycles; None if nothing is
-    left of any block.
+    """Return the gradient at the minimum as a sum over blocks of cycles; None if no block has
+    degrees of freedom left.
 
-    Errors of neighboring cycles may depend on each other and on the inputs. Numerators take the
-    common part of these errors, and no correction of single residuals restores it. The errors of a
-    block are therefore those of a prediction by a fit to the other blocks (delete-block jackknife:
-    Künsch 1989; Bell and McCaffrey 2002), which are larger than the true ones. The sum of their
-    squares is divided by its expectation for noise like that of the data, which has two parts:
-    white noise, and noise filtered by 1 / chi, as process noise is. The amounts of both follow from
-    two sums of squares of the residuals (variance components: Rao 1971).
+    Errors of neighboring cycles may depend on each other and on the inputs. Numerators fit the
+    common part of these errors, and no correction of single residuals restores it. Therefore the
+    residuals of a block are errors of a prediction by a fit to the other blocks (delete-block
+    jackknife: Künsch 1989; Bell and McCaffrey 2002). They are larger than the true errors. So the
+    sum of squares is divided by its expectation for noise like that of the data. This noise has two
+    parts: white noise, and noise filtered by 1 / chi (process noise). The amounts of both follow
+    from two sums of squares of the residuals (variance components: Rao 1971).
     """
     memory = fading(solution.c)
 
@@ -701,7 +707,7 @@ def block_scores(
     parts = list(itertools.chain(*grids))
     squares = np.sum([part.squares for part in parts], axis=0)
     filtered = sum(part.filtered for part in parts)
-    # Filtered noise adds to the first sum of squares as much as white noise adds to the second.
+    # (Filtered noise contributes as much to the first sum of squares as white noise to the second.)
     first, second = squares[:, 1:].mean(axis=1)
     dof = solution.dof.sum()
     white = np.array([[dof, first], [first, second]])
@@ -711,7 +717,7 @@ def block_scores(
     expected_by_white = by_white.sum(axis=0)
     expected = of_white * expected_by_white + of_filtered * by_filtered
     true = of_white * solution.curvature.sum(axis=0) + of_filtered * filtered
-    # In units in which noise like that of the data makes the sum one.
+    # Scale scores so that, for noise like that of the data, the expected sum of squares is one.
     try:
         half = np.linalg.inv(np.linalg.cholesky(expected))
         true = np.linalg.cholesky(true)
@@ -742,12 +748,13 @@ def _block_sums(
     memory: Coefficients,
     count: int,
 ) -> _BlockSums:
-    """Return the sums over so many blocks of each record.
+    """Return the sums over the blocks of each record.
 
     **Arguments:** `x`: columns for each output, the first measured. `memory`: c, fading.
     """
 
-    def backward(x):  # its product with white noise is that of x with filtered noise
+    # (backward(x) times white noise equals x times filtered noise)
+    def backward(x):
         return divide_by_chi(memory, (sampled * x)[:, ::-1])
 
     rows = (regression.remainder @ fit.root).reshape(*sampled.shape[:2], -1)

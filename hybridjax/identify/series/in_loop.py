@@ -4,12 +4,15 @@ With a controller at work the noise of the outputs goes round the loop into u. I
 
 $$\chi(q^{-N})\, y[n] = B_{n \bmod N}(q^{-1})\, u[n] + \varepsilon[n]$$
 
-neither the earlier outputs nor u are independent of $\varepsilon$, but the reference r is, and with
-it all that a model from r to (u, y) predicts. These predictions $\hat u$ and $\hat y$ are the
-instruments of u and of the earlier y (instrumental variables: Söderström and Stoica 1983; Gilson
-and Van den Hof 2005): an inaccurate model costs efficiency, and biases nothing. It has few
-dimensions, since noise that a model of many parameters fits would be correlated with $\varepsilon$.
-B is eliminated section by section, and the rest is linear in c.
+the earlier outputs and u depend on $\varepsilon$, but the reference r does not. A model from r to
+(u, y) predicts $\hat u$ and $\hat y$ from r alone, so that they do not depend on $\varepsilon$,
+either. They are the instruments of u and of the earlier y (instrumental variables: Söderström and
+Stoica 1983; Gilson and Van den Hof 2005). If the model is inaccurate, this costs efficiency, but
+causes no bias. It has few dimensions, since a model of many parameters would fit noise, which is
+correlated with $\varepsilon$.
+
+`fit_series` makes `LoopEquations` if references are given, and calls `fit`. B is eliminated section
+by section (`_section`), and the rest is linear in c (`solution`).
 """
 
 import dataclasses
@@ -34,23 +37,23 @@ from .records import PreparedRecords, delay_cycles, lagged_inputs
 from .subspace import subspace_model, without_drift
 
 
-# Signal-to-noise ratio of a combination of lagged inputs, above which its coefficient is estimated.
-# Smaller: noise of combinations that the reference hardly excites. Larger: bias by those left out.
+# The coefficient of a combination of lagged inputs is estimated if its signal-to-noise ratio
+# exceeds this. Smaller: noise by combinations that the reference hardly excites. Larger: bias by
+# combinations that are left out.
 _EXCITED = 5.0
-# Cycles of a block, at least. Fewer: errors of neighboring cycles count as independent, which they
-# are not. More: few blocks.
+# Least number of cycles in a block. Fewer: dependent errors of neighboring cycles count as
+# independent. More: few blocks.
 _BLOCK = 10
-# Least squared signal-to-noise ratio with which the instruments determine each multiplier. Smaller:
-# noise makes multipliers. Larger: weak ones are refused.
+# The instruments determine a multiplier if its squared signal-to-noise ratio exceeds this. Smaller:
+# noise counts as multipliers. Larger: weak multipliers are refused.
 _DETERMINED = 10.0
 
 
 def predicted(
     plant: list[SectionSeries], drive: list[SectionSeries], order: int
 ) -> Float[np.ndarray, "S T N nuy"]:
-    """Return inputs and outputs as the references explain them.
-
-    They are simulated, from zero, by a model with `order` dimensions.
+    """Return the inputs and outputs that the references predict. They are simulated from zero by a
+    model with `order` dimensions.
 
     **Raises:** `DefinitionError` for too few cycles.
     """
@@ -60,7 +63,8 @@ def predicted(
         closed.append(dataclasses.replace(r, y=y, outputs=(*r.outputs, *p.outputs)))
     records = PreparedRecords(closed)
     grid = without_drift(records.whole())
-    # (In units of what is left, or large drifts decide what the model explains.)
+    # (In units of the outputs without drift: otherwise outputs with a large drift would dominate
+    # the model.)
     square = (grid.y**2).mean(axis=(0, 1, 2))
     size = np.sqrt(square)
     records.scale = np.maximum(size, RANK * records.scale)
@@ -79,9 +83,10 @@ class SectionEquations(NamedTuple):
     numerators: Float[np.ndarray, "columns ny d1"]
     """The coefficients of these parts."""
     root: Float[np.ndarray, "columns r"]
-    """root @ root.T is their covariance, for noise of variance one."""
+    """A root of the covariance of these coefficients, root @ root.T, for noise of variance one."""
     taken: tuple[Float[np.ndarray, "rows r"], Float[np.ndarray, "rows r"]]
-    """The first, times the second transposed, maps errors to the part that numerators take."""
+    """The first matrix, times the transposed second one, maps errors to the part of them that
+    numerators fit."""
     dof: int
 
 
@@ -100,11 +105,11 @@ class Solution(NamedTuple):
 def best_order(
     data: RecordedData, references: Sequence[str], most: int
 ) -> tuple[int, str]:
-    """Return the largest number of multipliers, up to `most`, that the references determine, and
-    the obstacle to a larger number, if there was one."""
+    """Return the largest number of multipliers, up to `most`, that the references determine; and
+    the reason why a larger number cannot be tried, if there is one."""
     obstacle = ""
     for order in range(most, 1, -1):
-        # Too few cycles for so many: a finding shows the text.
+        # (Too few cycles for this order: the text becomes a finding.)
         try:
             solution = LoopEquations(*in_loop(data, references), order, None).solution
         except DefinitionError as error:
@@ -160,7 +165,8 @@ class LoopEquations:
         lags = self.lags * nu
         ends = [lags, 2 * lags]
         Z, U, late = np.split(rows, ends, axis=1)
-        # Combinations of lags, of which the reference excites those that stand out of the noise.
+        # Combinations of lagged inputs. Those whose response to the reference exceeds the noise are
+        # used.
         _, size, V = np.linalg.svd(Z, full_matrices=False)
         unexplained = np.linalg.norm((U - Z) @ V.T, axis=0)
         noise = unexplained / np.sqrt(max(used.sum(), 1))
@@ -296,7 +302,7 @@ class LoopEquations:
     ) -> Float[np.ndarray, "B d"]:
         """Return the sums of errors times instruments over blocks of cycles.
 
-        The errors of a block are those of numerators that are fitted to the other blocks."""
+        The errors of a block are those with numerators that are fitted to the other blocks."""
 
         def blocks(x: np.ndarray) -> np.ndarray:
             grid_shape = self.grid.y.shape[:2]

@@ -1,4 +1,11 @@
-"""The linearized output-error problem at some c: sums over all records, and its minimum in c."""
+"""The linearized output-error problem at given coefficients c of the denominator: sums over all
+records, and the minimum over c.
+
+`fit_series` calls `minimize`, which calls `linearize` at each c. `linearize` fits the numerators of
+every section (`SectionFit`), and adds up residuals and their derivatives by c (`Linearization`). A
+*grid* is a group of records of similar length (`records.py`). A wrong gradient comes from
+`SectionFit.of`.
+"""
 
 import functools
 import itertools
@@ -21,9 +28,10 @@ from .records import (
 
 
 Outputs = Callable[[int, CycleGrid, int], Float[np.ndarray, "S T ny C"]]
-"""C columns for each output, as a function of the number of a grid, the grid and a section."""
+"""A function (number of a grid, the grid, section) that returns C columns for each output."""
 Regress = Callable[[int, CycleGrid, int], list[SectionRegression]]
-"""The regressions of a section, one for each list of outputs."""
+"""A function (number of a grid, the grid, section) that returns one regression for each list of
+outputs with equal weights."""
 
 
 class SectionFit(NamedTuple):
@@ -35,7 +43,7 @@ class SectionFit(NamedTuple):
     coefficients: Float[np.ndarray, "r m C"]
     """Coefficients of the inputs, for C columns of each of m outputs."""
     slopes: Float[np.ndarray, "r d m C"]
-    """Their derivatives with respect to c."""
+    """Derivatives of the coefficients with respect to c."""
     dof: float
     products: Float[np.ndarray, "m C C"]
     """Products of the residuals of different columns."""
@@ -52,9 +60,9 @@ class SectionFit(NamedTuple):
     ) -> "SectionFit":
         """Fit the columns of all grids.
 
-        The normal equations are solved twice, and the second solution removes rounding errors: the
-        result is as accurate as that of one QR decomposition. The derivatives of the residuals omit
-        the term that vanishes with these (Kaufman 1975).
+        The normal equations are solved twice. The second solution removes rounding errors, so that
+        the result is as accurate as by a QR decomposition. Derivatives of the residuals omit the
+        term that is proportional to the residuals (Kaufman 1975).
         """
         pairs = list(zip(regressions, columns, strict=True))
         root = root_of(_total(r.along(r.remainder) for r in regressions))
@@ -125,7 +133,8 @@ class Linearization(NamedTuple):
     def as_residuals(
         self,
     ) -> tuple[Float[np.ndarray, " d1"], Float[np.ndarray, "d1 d"]]:
-        """Return d + 1 residuals with their Jacobian that have the same sums."""
+        """Return d + 1 residuals and their Jacobian that have the same sums of squares and
+        products."""
         values, vectors = np.linalg.eigh(self.curvature.sum(axis=0))
         size = np.sqrt(np.maximum(values, 0))
         along = vectors.T @ self.gradient.sum(axis=0)
@@ -146,7 +155,8 @@ def measured_outputs(k: int, part: CycleGrid, n: int) -> Float[np.ndarray, "S T 
 def sum_up(
     problem: OutputErrorProblem, c: Coefficients, outputs: Outputs, regress: Regress
 ) -> list[list[SectionFit]]:
-    """Return the fits of each section, with one regression for each list of outputs."""
+    """Return the fits of each section. Each list of outputs with equal weights is one
+    regression."""
     parts = problem.parts()
 
     def section(n: int) -> list[SectionFit]:
@@ -234,9 +244,10 @@ def each_fit(
 def minimize(
     problem: OutputErrorProblem, start: Coefficients, rough: bool = False
 ) -> tuple[Linearization, bool]:
-    """Return the problem at the c that minimizes the sum of squares, and whether it settled.
+    """Return the problem at the c with the least sum of squares, and whether the descent has
+    converged.
 
-    **Arguments:** `rough`: whether to stop where noise of variance one explains the next step.
+    **Arguments:** `rough`: whether to stop when noise of variance one could explain the next step.
     """
     last: list[Linearization] = []
 

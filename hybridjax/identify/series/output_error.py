@@ -5,7 +5,12 @@ With $\chi(q^{-N}) y = B_{n \bmod N}(q^{-1}) u$ and $v = \chi^{-1} u$, filtered 
 $$y[n] = \sum_r b_{n \bmod N}[r]\, v[n-r] + (\chi^{-1} g)[n] + \varepsilon[n],$$
 
 where g is free in the first cycles of each record: it represents inputs and outputs before the
-record. For given c every section is a linear regression of its own, in b and g.
+record. For given c (the coefficients of chi), the unknowns b and g of each section are a linear
+regression.
+
+`OutputErrorProblem` has the data of a fit that do not depend on c, and `SectionRegression` the
+regression of one section at some c. `linearization.py` and `delayed_outputs.py` call them. If
+unknowns are missing or too many, look at `SectionRegression.make`.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +28,7 @@ from .records import Columns, CycleGrid, PreparedRecords, lagged_inputs
 ByInput = Float[np.ndarray, "r *columns"]
 """Coefficients of the inputs, for each column."""
 Rows = Float[np.ndarray, "rows *columns"]
-"""Columns of all records, one below the other."""
+"""Columns with the rows of all records one below the other."""
 
 # Singular values of regressors, relative to the largest, below which they are rounding errors.
 # Larger: weakly excited combinations are dropped; smaller: rounding errors are fitted.
@@ -31,7 +36,8 @@ RANK = 1e-10
 
 
 class TooFewCycles(DefinitionError):
-    """Nothing is left of the samples of an output at section n; so many cycles are missing."""
+    """Raised if an output at section n has no degrees of freedom left. `missing`: number of cycles
+    that are missing."""
 
     def __init__(self, problem: Any, n: int, i: int, missing: int):
         self.missing = missing
@@ -43,9 +49,10 @@ class TooFewCycles(DefinitionError):
 
 
 class SectionRegression(NamedTuple):
-    """Regressors of the outputs of a section that have the same weights, in one grid.
+    """Regressors for those outputs of a section that have the same weights, in one grid (a group of
+    records).
 
-    Initial conditions and drift are unknowns of each record and are projected out here. The
+    Initial conditions and drift are unknowns of each record, and are projected out here. The
     coefficients of the inputs are common to all grids.
     """
 
@@ -53,13 +60,13 @@ class SectionRegression(NamedTuple):
     starts: Float[np.ndarray, "S T K"]
     """Responses to unknown initial conditions."""
     weight: Float[np.ndarray, "S T 1"]
-    """One for a sample, zero where there is none."""
+    """1 for a sample, 0 for a missing one."""
     basis: Float[np.ndarray, "S T k"]
     """Orthonormal basis of the weighted rows of initial conditions and drift, by record."""
     to_starts: Float[np.ndarray, "S k K"]
-    """Map from coefficients of the basis to those of the initial conditions."""
+    """Matrix from coefficients of the basis to coefficients of the initial conditions."""
     remainder: Float[np.ndarray, "rows r"]
-    """The weighted rows of the inputs without the part in the basis."""
+    """The weighted rows of the inputs, without their part in the basis."""
 
     @classmethod
     def make(
@@ -89,7 +96,7 @@ class SectionRegression(NamedTuple):
         return float(used - (self.basis**2).sum())
 
     def reduced(self, x: Columns) -> Rows:
-        """Return outputs, weighted, without the part in the basis."""
+        """Return weighted outputs without their part in the basis."""
         in_columns = x.reshape(*x.shape[:2], -1)
         left = self.weight * in_columns
         for _ in range(2):  # the second time removes rounding errors
@@ -105,7 +112,8 @@ class SectionRegression(NamedTuple):
         return np.tensordot(self.remainder.T, rows, 1)
 
     def response(self, a: ByInput, x: Columns) -> Columns:
-        """Return the response to the inputs and to the initial conditions that fit x best."""
+        """Return the response to the inputs with coefficients a, and to the initial conditions that
+        fit x best."""
         S, T = x.shape[:2]
         columns = x.reshape(S, T, -1)
         coefficients = a.reshape(len(a), columns.shape[2])
@@ -127,7 +135,7 @@ class OutputErrorProblem(NamedTuple):
     to_lags: list[Float[np.ndarray, "columns r"]]
     """For each section: the combinations of lagged inputs that are linearly independent."""
     alike: list[list[list[int]]]
-    """For each section: the outputs, in lists of equal weights."""
+    """For each section, the outputs, grouped in lists with equal weights."""
     scale: Float[np.ndarray, " ny"]
     """The units of the outputs."""
 
@@ -162,7 +170,7 @@ class OutputErrorProblem(NamedTuple):
                 rows.append(lagged[used])
             return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
 
-        # One section tells, before the work on all, that nothing is left of its samples.
+        # The section with the fewest samples is tested first, before the work on all sections.
         fewest = np.unravel_index(np.argmin(records.sampled), records.sampled.shape)
         n, i = map(int, fewest)
         if records.sampled[n, i] <= lags * nu:
@@ -200,7 +208,7 @@ class OutputErrorProblem(NamedTuple):
 
 
 def _alike(records: PreparedRecords) -> list[list[list[int]]]:
-    """Return the outputs of each section, in lists of those that are sampled together."""
+    """Return the outputs of each section, grouped in lists of outputs that are sampled together."""
     N, ny = records.sampled.shape
     equal = np.ones((N, ny, ny), bool)
     for grid in records.grids:
@@ -223,7 +231,7 @@ def _require_different_inputs(
     """
     nu = len(records.inputs)
     alone = [_independent(triangle[:, i::nu], 1).shape[1] for i in range(nu)]
-    # (Ranks of inputs in a narrow band are not exact.)
+    # (Numerical ranks of inputs in a narrow band are not exact.)
     most = sum(alone) - min(alone) / 2
     if rank < min(len(triangle), most):
         raise DefinitionError(

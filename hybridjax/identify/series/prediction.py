@@ -1,12 +1,16 @@
-r"""Errors of predictions one step ahead, and their derivatives.
+r"""Errors of predictions one step ahead by a periodic state-space model, and their derivatives.
 
 $$e[n] = y[n] - C[n] x[n] - D[n] u[n], \qquad x[n+1] = A[n] x[n] + B[n] u[n] + K[n] e[n]$$
 
-With K = 0 these are the errors of a simulation (output error). A change of the matrices at
-section n changes the predictions by $\delta C\,x + \delta D\,u$ there, and the next state by
-$\delta A\,x + \delta B\,u + \delta K\,e - K (\delta C\,x + \delta D\,u)$, which decays with
-$F = A - K C$. The error of a missing output is replaced by its mean, given the errors of the other
-outputs of this sample.
+With K = 0 these are the errors of a simulation (output error). A change of the matrices at section
+n changes the predictions by $\delta C\,x + \delta D\,u$ there, and the next state by $\delta A\,x +
+\delta B\,u + \delta K\,e - K (\delta C\,x + \delta D\,u)$, which decays with $F = A - K C$. The
+error of a missing output is replaced by its conditional mean, given the errors of the other outputs
+of the same sample.
+
+`fit_ldtp` calls `SeriesProblem` (cost, linearized equations, weights), and `hj.validate` calls
+`Predictor`. `SeriesProblem.path` computes states and errors, and `slopes_of` the derivatives of
+predictions: compare these two if a fit does not converge.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,14 +38,15 @@ class SeriesPart(NamedTuple):
 
     u: Float[np.ndarray, "N R T nu"]
     y: Float[np.ndarray, "N R T ny"]
-    """In units of a scale; zero where there is no sample."""
+    """Outputs in units of a scale; zero where there is no sample."""
     sampled: Bool[np.ndarray, "N R T ny"]
     lost: Bool[np.ndarray, "N R T ny"]
-    """Inside of a record, but not sampled."""
+    """Whether a sample lies inside of its record, but is missing."""
     first: Int[np.ndarray, " R"]
     """The section at which each record starts."""
     drift: Float[np.ndarray, "N R T ny K"]
-    """An orthonormal basis of the drift of the samples of each output, zero beyond its rank."""
+    """An orthonormal basis of the drift of each output at its samples; columns beyond its rank are
+    zero."""
 
     @classmethod
     def of(cls, grid: CycleGrid, scale: Float[np.ndarray, " ny"]) -> "SeriesPart":
@@ -90,14 +95,14 @@ class Path(NamedTuple):
     entering: list[Float[np.ndarray, "R T ny"]]
     """Errors that K multiplies, with their means for missing outputs."""
     error: list[Float[np.ndarray, "R T ny"]]
-    """Zero where an output is missing, and without drift."""
+    """Errors, with drift removed; zero where an output is missing."""
     starts: list[Float[np.ndarray, "R rows s"]]
     """Responses of the predictions to the initial states, whitened."""
     start_gram: Float[np.ndarray, "R s s"]
 
 
 class SeriesProblem(NamedTuple):
-    """Records that a model is to predict."""
+    """Records of outputs that a model predicts."""
 
     parts: Iterable[SeriesPart]
     S: Float[np.ndarray, "N ny ny"]
@@ -159,7 +164,7 @@ class SeriesProblem(NamedTuple):
                 gradient += white.ravel() @ flat
                 by_record = J.reshape(R, -1, P)
                 along += path.starts[n].mT @ by_record
-            # Less what the initial states explain.
+            # (Less the part that the initial states explain.)
             taken = _solve_starts(path.start_gram, along)
             explained = np.tensordot(along, taken, ((0, 1), (0, 1)))
             gram -= explained
@@ -201,7 +206,8 @@ class SeriesProblem(NamedTuple):
             sampled = y[n] * part.sampled[n]
             later[..., 0] += np.matvec(gain[n], sampled)
 
-        # The first column is driven, the others start from each coordinate of the initial state.
+        # The first column is the response to the inputs. Each other column is the response to one
+        # coordinate of the initial state.
         filled = [1 + starts] * N
         shape = (R, T, 1 + starts)
         states = []
@@ -248,8 +254,8 @@ class SeriesProblem(NamedTuple):
         )
 
     def _weights(self, part: SeriesPart, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrix of the mean of all errors, given the sampled ones, and the matrix that
-        whitens the sampled ones."""
+        """Return two matrices: from the sampled errors to the conditional mean of all errors, and
+        from the sampled errors to independent ones of variance one."""
         S = self.S[n]
         identity = np.eye(len(S))
         lost = part.lost[n]
@@ -283,8 +289,8 @@ def recursion(
 ) -> Iterator[Columns]:
     """Iterate over x at each section, where $x[n+1] = F[n] x[n] + \\ldots$ begins at zero.
 
-    All cycles are computed in parallel, first from zero at the start of each cycle, and then from
-    the states at the starts, which the first pass gives.
+    All cycles are computed in parallel, in two runs. The first run begins each cycle at zero, which
+    gives the states at the starts of all cycles; the second run begins at these.
 
     **Arguments:**
 
@@ -465,7 +471,7 @@ class Predictor(NamedTuple):
     def predicted(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
-        """Return the outputs expected at each sample, given the samples before it."""
+        """Return the expected outputs at each sample, given all earlier samples."""
         ones = np.ones(self.S.shape[1])
         part = SeriesPart.of(grid, ones)
         problem = SeriesProblem(

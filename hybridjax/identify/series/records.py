@@ -1,4 +1,9 @@
-"""Records as fits use them: grids of records, cycles and sections, with delays and filters."""
+"""Records in the form in which fits to time series use them: grids of records, cycles and sections.
+
+A `CycleGrid` has S records of T cycles with N sections each. `PreparedRecords(data)` checks records
+and sorts them into grids of similar length. The functions at the end delay and filter signals from
+cycle to cycle (`lagged_inputs`, `divide_by_chi`). Missing samples are zero in a grid, and marked.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,15 +25,16 @@ from ...experiments.record import (
 from ..descent import Coefficients
 
 
-# Cycles of the fastest drift that fits try, to see whether it changes their multipliers. More: a
-# faster one passes for a multiplier. Fewer: drifts explain so much that multipliers become vague.
+# Shortest wavelength, in cycles, of the drift that fits try, to see whether it changes their
+# multipliers. Longer: faster drifts look like multipliers. Shorter: drifts explain so much that
+# multipliers become uncertain.
 SLOW = 20.0
 MAY_DRIFT = Finding(
     "drift",
     f"outputs may drift: `with_drift({SLOW:g})`, or `SectionSeries(drift=)`, changes multipliers.",
 )
-# Level of the confidence regions of multipliers that a drift must leave (drift moves them further
-# than a missing multiplier does). Lower: right fits are doubted; higher: drifts pass.
+# A drift matters if it moves multipliers out of confidence regions of this level. (Drift moves them
+# further than a missing multiplier does.) Lower: right fits get a finding. Higher: drifts pass.
 OF_DRIFT = 0.999
 
 
@@ -89,7 +95,7 @@ class CycleGrid(NamedTuple):
 
     @property
     def age(self) -> Int[np.ndarray, "S T N"]:
-        """The number of samples from the start of each record to each sample, which counts."""
+        """The number of samples from the start of each record up to and including each sample."""
         return np.cumsum(self.inside.reshape(len(self.u), -1), axis=1).reshape(
             self.inside.shape
         )
@@ -103,7 +109,7 @@ def count_cycles(record: SectionSeries) -> int:
 def drift_waves(record: SectionSeries) -> Float[np.ndarray, "T K"]:
     """Return the basis of a drift: cosines in the cycles, down to a wavelength of `record.drift`.
 
-    The first is a constant. Records that announce no drift have none.
+    The first is a constant. Records without a declared drift have no basis.
     """
     T = count_cycles(record)
     if record.drift is None:
@@ -118,12 +124,12 @@ class PreparedRecords:
     """Records as grids of similar lengths.
 
     **Fields:** `records`, without unknown inputs. `n_sections`, `lead`, `inputs`, `outputs`: as in
-    `SectionSeries`; `about`: by name. `grids`: the grids. `begins`: for each grid (S,) the cycles
-    of all records before each of its own. `cycles`: number of cycles of the longest record.
-    `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
+    `SectionSeries`; `about`: by name. `grids`: the grids. `begins`: for each grid, (S,): the number
+    of cycles of all records before each record of the grid. `cycles`: number of cycles of the
+    longest record. `sampled` (N, ny): number of samples. `scale` (ny,): rms of the outputs.
 
-    **Arguments:** `free_start`: whether the states at the starts are unknown. Records that drift
-    are then cut into pieces with starts and drifts of their own, because the time of fits grows
+    **Arguments:** `free_start`: whether the states at the starts are unknown. Records with drift
+    are then cut into pieces, each with its own start and drift, because the time of a fit grows
     with the third power of their length. Default: False.
     """
 
@@ -178,7 +184,7 @@ def _require_signals(
 def with_drift(records: Sequence[SectionSeries]) -> list[SectionSeries]:
     """Return the first 1000 cycles of records, with unknown drifts slower than `SLOW` cycles.
 
-    Records that may drift as fast already are left out.
+    Records with a drift that is declared as fast already are left out.
     """
     n = 1000 * records[0].n_sections
     slower = [record for record in records if (record.drift or np.inf) > SLOW]
@@ -197,9 +203,11 @@ def _pieces(record: SectionSeries) -> list[SectionSeries]:
 def _grids(
     records: Sequence[SectionSeries],
 ) -> tuple[list[CycleGrid], list[Int[np.ndarray, " S"]]]:
-    """Put records on grids, each at least half as long as the longest of its grid.
+    """Put records on grids, such that each record is at least half as long as the longest one of
+    its grid.
 
-    **Returns:** the grids, and the number of cycles of all records before each of theirs.
+    **Returns:** the grids, and for each of their records the number of cycles of all records before
+    it.
     """
     cycles = np.array([count_cycles(record) for record in records])
     before = np.cumsum(cycles) - cycles

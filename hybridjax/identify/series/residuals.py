@@ -1,4 +1,10 @@
-"""Tests of residuals, section by section: their correlations in time and with inputs."""
+"""Tests of residuals, section by section: correlations in time and with inputs.
+
+`hj.validate` calls `whiteness_test` and `independence_test` for data that were not fitted, and
+`whitened` to take the errors of the fit into account. Fits call `about_misfit` and `about_answers`,
+which return findings about residuals of the same data. If a good model is rejected, look at
+`whitened`; if feedback is reported where there is none, at `feedback_test`.
+"""
 
 from collections.abc import Sequence
 from itertools import compress
@@ -18,26 +24,27 @@ Root = Float[np.ndarray, "S T ny r"]
 """A root of the covariance of errors of a section."""
 ByOutput = Float[np.ndarray, " ny"]
 
-# Samples of a section, below which its correlations are not tested. Fewer: their distribution is
-# not normal; more: short records cannot be validated.
+# Least number of samples of a section for a test of correlations. Fewer: their distribution is not
+# normal. More: short records cannot be validated.
 FEWEST_SAMPLES = 8
 # Probability with which a misfit that counts as visible is detected. Larger: models are called
 # better tested than they are; smaller: misfits that are detected as a rule count as invisible.
 _POWER = 0.8
-# Probability that noise alone counts as an answer, of inputs to earlier outputs, or of outputs to a
-# reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open loops
-# are refused.
+# Probability that noise alone counts as a response: of inputs to earlier outputs, or of outputs to
+# a reference at the same section. Smaller: controllers and weak feed-through pass. Larger: open
+# loops are refused.
 ANSWER = 1e-3
-# Level at which residuals of a fit to the same data are not white. (Fits make them whiter: of white
-# noise none of 120 was below 1 %.) Larger: white noise is doubted. Smaller: weak process noise
-# passes, whose standard errors are too small.
+# Level of the test whether residuals of a fit to the same data are white. (A fit makes residuals
+# whiter: with white noise, none of 120 p-values was below 1 %.) Larger: white noise gives a
+# finding. Smaller: weak process noise passes, and standard errors are too small.
 _COLORED = 0.01
-# Shifts by whole cycles from which the dependence of residuals on inputs of other cycles follows,
-# and the deviates by which that on their own must exceed it. More shifts: time. Larger deviates:
-# too few dimensions are called noise. Smaller: noise is called too few dimensions.
+# Residuals are also compared with inputs of other cycles, shifted by this many whole numbers of
+# cycles. The dependence on inputs of the same cycle must exceed that on the shifted ones by a
+# number of standard deviations. More shifts: time. More standard deviations: a model with too few
+# dimensions passes. Fewer: noise counts as too few dimensions.
 _SHIFTS = 8
 _ALONE = 4.0
-# Advice where inputs answer residuals.
+# Advice if inputs respond to residuals.
 FOR_WHITE_NOISE = (
     "the fit is biased; name their `references`, or pass noise='innovations'"
 )
@@ -58,10 +65,11 @@ UNSEEN = Finding(
 
 
 def whitened(error: Signals, spread: Sequence[Root]) -> Signals:
-    """Return residuals that are white if the noise is, whatever errors a fit to other data has.
+    """Return residuals that are white if the noise is white, with the errors of a fit to other data
+    taken into account.
 
-    **Arguments:** `spread`: for each section, a root of the covariance of these errors, for noise
-    of variance one. Residuals are divided by the root of the sum of both covariances.
+    **Arguments:** `spread`: for each section, a square root of the covariance of these errors, for
+    noise of variance one. Residuals are divided by the root of the sum of both covariances.
     """
     error = error.copy()
     for n, root in enumerate(spread):
@@ -98,7 +106,8 @@ def whiteness_test(
         tested[:, k] = samples >= FEWEST_SAMPLES
         deviation = np.sqrt(np.maximum(samples, 1))
         z[:, k] = tested[:, k] * total / deviation
-    # The mean over the sections of each lag, and the deviations from it: independent.
+    # For each lag, two independent statistics: the mean over the sections, and the deviations from
+    # it.
     sections = tested.sum(axis=0)
     square_of_sum = z.sum(axis=0) ** 2
     by_lag = square_of_sum / np.maximum(sections, 1)
@@ -109,7 +118,7 @@ def whiteness_test(
     if N > 1:
         # (One section has no deviations from the mean.)
         p_deviations = stats.chi2.sf(deviations, sections.sum(axis=0) - degrees)
-        # The smaller of two, as a p-value.
+        # The p-value of the smaller of two p-values.
         smaller = np.minimum(p, p_deviations)
         p = -np.expm1(2 * np.log1p(-smaller))
     return z, p
@@ -124,14 +133,14 @@ def independence_test(
 ) -> tuple[Float[np.ndarray, "N lags ny nu"], ByOutput, ByOutput]:
     """Test the part of residuals that present and past inputs explain, section by section.
 
-    **Arguments:** `error`: NaN where the inputs of so many lags are not known. `spread`: for each
-    section, a root of the covariance that errors of a fit to other data have, for noise of
-    variance one. Default: no errors.
+    **Arguments:** `error`: residuals; NaN where some of the lagged inputs are not known. `spread`:
+    for each section, a square root of the covariance of the errors of a fit to other data, for
+    noise of variance one. Default: no errors.
 
     **Returns:** the correlations with the inputs, the p-values, and the smallest visible misfits,
     in standard deviations of the noise, for tests of this level. A misfit of rms r times the noise
-    makes F ratios of n samples noncentral, by $n r^2$. The power is that of one F ratio with the
-    degrees of freedom of all sections, which is 1 to 4 % too optimistic.
+    makes F ratios of n samples noncentral, by $n r^2$. The power is computed for one F ratio with
+    the degrees of freedom of all sections, and is 1 to 4 % too large.
     """
     S, T, N, ny = error.shape
     z = np.zeros((N, lags, ny, u.shape[3]))
@@ -211,7 +220,8 @@ def _regressed(
 
 
 def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
-    """Return whether the residuals of each output are only rounding, and tell nothing."""
+    """Return whether the residuals of each output are rounding errors only, so that they cannot be
+    tested."""
     square = np.nansum(error**2, axis=(0, 1, 2))
     left = np.sqrt(square)
     square_of_outputs = (grid.y**2).sum(axis=(0, 1, 2))
@@ -222,15 +232,16 @@ def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
 def about_misfit(
     outside: CycleGrid, grid: CycleGrid, error: Signals, innovations: bool, direct: bool
 ) -> list[Finding]:
-    """Return a finding if residuals depend on inputs of the period before them, or on each other.
+    """Return a finding if residuals depend on inputs of the period before, or on other residuals.
 
-    Residuals that depend on each other may seem to depend on the inputs, too, if these are also
-    correlated in time. The inputs of other cycles then seem as related to them, and are compared.
+    Residuals that are correlated in time may seem to depend on inputs that are also correlated in
+    time. They then seem to depend on inputs of other cycles as much. Therefore both dependences are
+    compared.
 
     **Arguments:** `outside`: the inputs that do not respond to outputs. `error`: the residuals of
     `grid`, NaN where an output was not sampled. `innovations`: whether the fit has process noise.
-    `direct`: whether it has a D. Without one, inputs at the section of a residual are no cause of
-    it: a controller may have made them of the output.
+    `direct`: whether it has a D. Without D, inputs at the section of a residual are left out, since
+    a controller may have made them from the output.
     """
     S, T, N, ny = error.shape
     is_late = (grid.age > N)[..., None]
@@ -292,7 +303,7 @@ def _of_other_cycles(inputs: Signals, error: Signals) -> ByOutput:
 def about_answers(
     grid: CycleGrid, error: Signals, inputs: tuple[str, ...], remedy: str
 ) -> list[Finding]:
-    """Return a finding if inputs answer earlier residuals, as by a controller."""
+    """Return a finding if inputs respond to earlier residuals, as a controller does."""
     if is_exact(grid, error).all():
         return []
     answers = feedback_test(grid, error) < ANSWER
@@ -304,10 +315,11 @@ def about_answers(
 
 
 def feedback_test(grid: CycleGrid, error: Signals) -> Float[np.ndarray, " nu"]:
-    """Test whether inputs answer residuals of a model of the outputs at earlier sections.
+    """Test whether inputs respond to residuals of a model of the outputs at earlier sections.
 
-    The part of each input that its own past does not explain is regressed on these residuals: it
-    is white for any spectrum of the input, so that residuals may be colored.
+    The part of each input that its own past does not explain is regressed on these residuals. This
+    part is white whatever the spectrum of the input is, so that the test also holds for colored
+    residuals.
 
     **Returns:** p-values; small ones show a controller at work.
     """

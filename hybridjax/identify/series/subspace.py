@@ -1,9 +1,10 @@
 """First state-space models of time series by a subspace method, and a test for direct responses.
 
-Both regress the signals at a section on their past (`_sections`, `_regress`). `subspace_model`
-makes the model from which `fit_ldtp` descends, and the one that predicts the instruments of a loop
-(`in_loop.py`): if it is inaccurate, this costs iterations or efficiency. `answers_at_once` tests
-whether outputs respond to inputs at the same section, so that a fit needs D.
+There are three functions. `subspace_model` makes the model from which `fit_ldtp` descends, and the
+model that predicts the instruments of a loop (`in_loop.py`). If it is inaccurate, `fit_ldtp` needs
+more iterations, and the fit in the loop loses efficiency. `answers_at_once` tests whether outputs
+respond to inputs at the same section, so that `fit_ldtp` needs D. `without_drift` removes the drift
+of signals. The first two regress the signals at a section on their past (`_sections`, `_regress`).
 """
 
 from collections.abc import Sequence
@@ -22,11 +23,11 @@ from .records import CycleGrid, PreparedRecords, Signals
 from .residuals import ANSWER
 
 
-# Samples of a section for each coefficient of the regression on its past. Larger: a short past,
-# which states outlast; smaller: noise.
+# Number of samples of a section for each coefficient of the regression on its past. Larger: the
+# past is too short for slow states. Smaller: noise.
 _ROWS = 3
-# Part by which the squared length of every regressor is enlarged. Larger: bias; smaller: noise in
-# combinations that are hardly excited.
+# The squared length of every regressor is enlarged by this part (ridge regression). Larger: bias.
+# Smaller: noise in combinations that are hardly excited.
 _SHRINKAGE = 1e-6
 
 
@@ -38,8 +39,8 @@ def subspace_model(
 ) -> PeriodicModel:
     """Return a model with these dimensions, with or without K and D.
 
-    Each output is regressed on its past and that of the inputs, section by section. The effect of
-    the past of a section on the outputs from there on is a matrix whose rank is the dimension of
+    Section by section, each output is regressed on past outputs and past inputs. The matrix from
+    the past of a section to the outputs from this section on has a rank that is the dimension of
     the state (Chiuso 2007, "PBSID", for each section of the period). Samples before a record count
     as zero: many short records that begin anywhere give a worse model.
 
@@ -58,7 +59,7 @@ def subspace_model(
             f"{samples} cycles are too few to begin with {most} dimensions: record about "
             f"{_ROWS * columns * needed}, or give a model as `initial`: `fit_series(...).model`."
         )
-    # The effect of the past of each section on its outputs.
+    # For each section, the matrix from its past to its outputs.
     rules = []
     for section in sections:
         known = [section.u * direct, section.past(past)]
@@ -70,7 +71,7 @@ def subspace_model(
     horizon = max(rows_of_outputs, longest)
     to_state = []
     for n, section in enumerate(sections):
-        # The effect of rows that are older by i samples.
+        # For outputs i samples later, the past begins i samples earlier.
         ahead = np.zeros((past * columns, horizon, ny))
         for i in range(min(horizon, past)):
             kept = (past - i) * columns
@@ -92,17 +93,17 @@ def subspace_model(
 
 
 def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | None:
-    """Test whether the outputs answer the inputs of a loop at their own section.
+    """Test whether outputs in a loop respond to inputs at their own section.
 
-    If so, they answer a reference at once, given the past of all signals: the likelihood-ratio
-    test, section by section (Anderson, *Multivariate Statistical Analysis*, 2003, section 8.4),
-    which holds for any controller. Inputs that answer outputs at once look the same in the inputs.
+    If they do, they also respond to a reference at once, given the past of all signals. This is
+    tested section by section by a likelihood ratio (Anderson, *Multivariate Statistical Analysis*,
+    2003, section 8.4), whatever the controller is.
 
-    **Returns:** None if they seem not to, and nothing but the reference and the past make the
-    inputs: their past may then determine them, and a fit shows more.
+    **Returns:** None if they seem not to respond, but the inputs follow from the reference and the
+    past alone. The test then has no power, and two fits must be compared.
 
-    **Raises:** `DefinitionError` if both answer each other at once: no model of the noise tells
-    them apart.
+    **Raises:** `DefinitionError` if inputs and outputs respond to each other at once, which no
+    model of the noise can separate.
     """
     N = records.n_sections
     ny = len(records.outputs)
@@ -115,7 +116,8 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
     for section in _sections(records, without_drift(drive.whole()).u):
         by_samples = min(len(section.y) // (_ROWS * columns), default_horizon(N))
         length = max(by_samples, 1)
-        # (Zeros before a record are no past that determines inputs.)
+        # (Samples whose past reaches beyond the start of the record are left out: its zeros do not
+        # determine inputs.)
         later = age[section.record, section.time] > length
         if later.sum() <= columns * length + nr:
             continue
@@ -132,7 +134,7 @@ def answers_at_once(records: PreparedRecords, drive: PreparedRecords) -> bool | 
         unexplained = u - rows @ _regress(rows, u)
         left += float((unexplained**2).sum())
         whole += float((u**2).sum())
-    # (Rounding makes the statistic of a reference that its past predicts negative.)
+    # (If the past predicts the reference, the statistic may be negative by rounding.)
     half = max(statistic, 0.0) / 2
     p = special.gammaincc(N * ny * nr / 2, half)
     answer = bool(p <= ANSWER)
@@ -157,8 +159,8 @@ def _log_size(rows: np.ndarray, y: np.ndarray, floor: np.ndarray) -> float:
 def without_drift(grid: CycleGrid) -> CycleGrid:
     """Return records without the drift of each section, in outputs and inputs.
 
-    Offsets of inputs drive a drift of outputs, which a controller answers: without the drift of all
-    signals, the rest is the response to the rest.
+    Offsets of inputs cause a drift of outputs, to which a controller responds. Once the drift of
+    all signals is removed, the remaining outputs are the response to the remaining inputs.
     """
     no_columns = grid.drift[..., :0]
 
@@ -184,7 +186,7 @@ def without_drift(grid: CycleGrid) -> CycleGrid:
 def _sections(
     records: PreparedRecords, *more: Float[np.ndarray, "S T N k"]
 ) -> "list[_Section]":
-    """Return the samples of more signals, the inputs and the outputs at each section."""
+    """Return the samples of further signals, inputs and outputs at each section."""
     grid = without_drift(records.whole())
     ny = len(records.outputs)
     scaled = grid.y / records.scale
@@ -206,8 +208,8 @@ class _Section:
         self.u, self.y = np.split(signals, [-ny], axis=1)
 
     def past(self, length: int, later: int = 0) -> Float[np.ndarray, "samples columns"]:
-        """Return the `length` samples before, `later` samples later: newest first, zero before a
-        record."""
+        """Return the `length` samples before each sample that lies `later` samples later. The
+        newest come first; before a record, they are zero."""
         first = self.time[:, None] + later - 1
         back = first - np.arange(length)
         is_inside = back >= 0

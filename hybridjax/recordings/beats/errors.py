@@ -1,13 +1,17 @@
-r"""Errors of intervals: the jitter of each, and a rate that wanders.
+r"""Errors of intervals between events: jitter of each interval, and a rate that wanders.
 
-The phase at the end of an interval has the variance $s^2 w T$ (the jitter), so that the duration
-has this variance divided by the square of the rate at which the phase reaches 1. The rate $w + e$
-of an interval may differ from that of its trial, by a stationary process with
-$\mathrm{cov}(e_j, e_k) = \sigma^2 e^{-|t_j - t_k|/\theta}$: an autoregression of order 1 for evenly
-spaced intervals, independent for $\theta = 0$, and a random walk if $\theta$ is longer than the
-trial. Its parameters maximize the restricted likelihood (Patterson and Thompson 1971), which a
-Kalman filter evaluates (Harvey, *Forecasting, Structural Time Series Models and the Kalman Filter*,
-1989).
+The phase at the end of an interval of duration T has the variance $s^2 w T$ (the jitter), where w
+is the rate. The duration has this variance divided by the square of the rate at which the phase
+reaches 1. The rate $w + e$ of an interval may differ from the rate w of its trial. The difference e
+is a stationary process with $\mathrm{cov}(e_j, e_k) = \sigma^2 e^{-|t_j - t_k|/\theta}$: an
+autoregression of order 1 for evenly spaced intervals, independent for $\theta = 0$, and a random
+walk if $\theta$ is longer than the trial. Its parameters maximize the restricted likelihood
+(Patterson and Thompson 1971), which a Kalman filter evaluates (Harvey, *Forecasting, Structural
+Time Series Models and the Kalman Filter*, 1989).
+
+`estimation.py` calls `estimate_wander` with residuals of durations, and `whitening` to make errors
+independent (`Whitening`). A wrong standard error of a curve under slow inputs has its cause in
+`estimate_wander`.
 """
 
 from typing import NamedTuple
@@ -22,16 +26,17 @@ from .model import Forecast, Intervals
 Lanes = Float[np.ndarray, " L"]
 Columns = Float[np.ndarray, "L c"]
 
-# Times after which a rate is forgotten, in median intervals, and standard deviations of its change
-# from an interval to the next, in units in which the jitter of an interval is 1, that are compared.
-# Finer or wider: time. Coarser: errors of curves are those of the nearest pair, up to 20 % off.
+# Grid of wandering rates that are compared: memories (times after which a rate is forgotten, in
+# median intervals), and standard deviations of the change of the rate from one interval to the
+# next, in units of the jitter. Finer or wider: time. Coarser: errors of curves are wrong by up to
+# 20 %.
 _MEMORIES = 2.0 * 4.0 ** np.arange(6)
 _CHANGES = 0.03 * 2.0 ** np.arange(7)
-# Twice the logarithm of the likelihood ratio from which on a rate wanders. Larger: errors of curves
-# under slow inputs are too small. Smaller: noise is taken for a wandering rate.
+# A rate wanders if twice the logarithm of the likelihood ratio exceeds this. Larger: errors of
+# curves under slow inputs are too small. Smaller: noise is taken for a wandering rate.
 _LEAST_GAIN = 6.0
-# Degrees of freedom that must be left for a test of wandering rates. Fewer: their variance is zero
-# or unknown. More: short recordings never show one.
+# Least degrees of freedom for a test of wandering rates. Fewer: their variance is zero or unknown.
+# More: short recordings never show a wandering rate.
 _FEWEST_LEFT = 3
 
 
@@ -39,9 +44,11 @@ class Wander(NamedTuple):
     """A rate that wanders within trials."""
 
     size: float
-    """Standard deviation of the rate, in cycles per second and standard deviations of jitter."""
+    """Standard deviation of the rate in cycles per second, divided by the standard deviation of the
+    jitter."""
     memory: float
-    """Time after which it is forgotten, in s; zero for a rate that every interval has anew."""
+    """Time after which the rate is forgotten, in s; zero if the rates of intervals are
+    independent."""
 
     @staticmethod
     def none() -> "Wander":
@@ -49,10 +56,10 @@ class Wander(NamedTuple):
 
 
 class Whitening(NamedTuple):
-    """What turns deviations of durations into independent errors of one variance.
+    """A linear filter that turns deviations of durations into independent errors of equal variance.
 
-    The errors of successive intervals obey a recursion of first order, which a banded matrix
-    undoes for many columns at once.
+    Errors of successive intervals obey a recursion of first order. A banded matrix inverts it for
+    many columns at once.
     """
 
     weight: Lanes
@@ -60,9 +67,9 @@ class Whitening(NamedTuple):
     by_drift: Lanes
     """Derivatives of weighted durations by the wandering rate."""
     kept: Lanes
-    """Part of the forecast of the rate that the next one keeps."""
+    """Part of the forecast of the rate that is kept for the next interval."""
     learned: Lanes
-    """Part of a deviation that the next forecast of the rate takes."""
+    """Part of a deviation that is added to the next forecast of the rate."""
     scale: Lanes
     """Standard deviations of the deviations from forecasts."""
 
@@ -82,7 +89,7 @@ class Whitening(NamedTuple):
         return (y - drifting) / self.scale[:, None]
 
     def missed(self, residual: Lanes) -> Lanes:
-        """Return by how much of a cycle forecasts miss that know all earlier intervals."""
+        """Return the errors, in cycles, of forecasts that use all earlier intervals."""
         return self(residual[:, None])[:, 0] * self.scale
 
     @property
@@ -98,7 +105,7 @@ def whitening(
     used: Bool[np.ndarray, " L"],
     wander: Wander,
 ) -> Whitening:
-    """Return how errors about a forecast become independent.
+    """Return the filter that makes errors of a forecast independent.
 
     **Arguments:** `ahead`: the forecast. `rates` (L,): of the trial of each interval. `used`: the
     intervals that are not miscounted.
@@ -133,8 +140,9 @@ def _filters(
 ) -> tuple[
     Float[np.ndarray, "L W"], Float[np.ndarray, "L W"], Float[np.ndarray, "L W"]
 ]:
-    """Return `kept`, `learned` and `scale` of Kalman filters for W wandering rates at once, which
-    have the variances `stationary`, and of which `left` remains in the next interval."""
+    """Return `kept`, `learned` and `scale` of Kalman filters for W wandering rates at once.
+    `stationary`: variances of the rates. `left`: part of a rate that is left in the next
+    interval."""
     drift = by_drift[:, None]
     variance = np.empty_like(left)
     now = stationary
@@ -166,7 +174,8 @@ def estimate_wander(
     residual: Lanes,
     columns: Columns,
 ) -> Wander:
-    """Return the rates of the largest restricted likelihood; wandering ones if they gain enough.
+    """Return the wandering rate of the largest restricted likelihood; none if it is hardly larger
+    than without wandering.
 
     **Arguments:** `residual` (L,): of the durations. `columns` (L, c): derivatives of the durations
     by what was fitted; the rates of trials are fitted, too.
@@ -192,8 +201,8 @@ def estimate_wander(
             rows.append((_improbable(intervals, white, errors), wander))
         return rows
 
-    # Rates that every interval has anew make some intervals noisier than others: without them, a
-    # wandering rate would explain that, too.
+    # Independent rates (without memory) make some intervals noisier than others. They are compared,
+    # too: otherwise a wandering rate would explain this.
     changes = (_CHANGES / period).tolist()
     anew = [Wander.none()] + [Wander(change, 0.0) for change in changes]
     independent = min(improbable(anew))
@@ -211,11 +220,11 @@ def estimate_wander(
 
 
 class WithoutRates(NamedTuple):
-    """Columns of independent errors without what the rates of the trials explain of them."""
+    """Columns of independent errors, without the part that changes of the trials' rates explain."""
 
     rest: Columns
     along: Float[np.ndarray, "trials c"]
-    """Change of each trial's rate that explains most."""
+    """Change of each trial's rate that explains most of the columns."""
     power: Float[np.ndarray, " trials"]
     """Sum of the squares of the derivatives by each rate."""
 
@@ -223,8 +232,8 @@ class WithoutRates(NamedTuple):
 def without_rates(
     intervals: Intervals, by_rate: Lanes, columns: Columns
 ) -> WithoutRates:
-    """Return columns without what rates explain, whose derivatives are `by_rate`, by least
-    squares."""
+    """Return columns without the part that changes of the rates explain (by least squares).
+    `by_rate`: derivatives by the rates."""
     power = np.maximum(intervals.sums(by_rate**2), np.finfo(float).tiny)
     products = np.stack([intervals.sums(by_rate * x) for x in columns.T], axis=1)
     along = products / power[:, None]

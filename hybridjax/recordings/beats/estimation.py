@@ -2,14 +2,19 @@ r"""Phase response curves from intervals: penalized least squares on durations.
 
 The coefficients of a curve have prior variances $\tau^2 / k^4$, as those of a smoothing spline do
 (Wahba, *Spline Models for Observational Data*, 1990). $\tau$ maximizes its posterior density. Its
-exponential prior has as mean the curve under which the standard deviation of the input would double
-or stop the rhythm (a penalty of complexity: Simpson et al., Statistical Science 32, 2017). Other
-probable values contribute to the covariance of the curve (Kass and Steffey 1989): where the data
-hardly determine a shape, the errors of one value would be far too small.
+prior is exponential; the mean of the prior belongs to a curve under which an input of one standard
+deviation would double the rate or stop the rhythm (a penalty of complexity: Simpson et al.,
+Statistical Science 32, 2017). The covariance of the curve is averaged over all probable values of
+$\tau$ (Kass and Steffey 1989): if the data hardly determine a shape, errors for a single value
+would be far too small.
 
-Errors of intervals are independent after a wandering rate is taken out (`errors.py`). Those of a
-block may still add up to more than independent errors would: the likelihood is that of errors with
-as much variance as sums over blocks have (quasi-likelihood: McCullagh 1983).
+Errors of intervals are independent once a wandering rate is removed (`errors.py`). If sums of
+errors over blocks still have a larger variance, the likelihood uses this variance
+(quasi-likelihood: McCullagh 1983).
+
+`response.py` calls `fit_curve` (jitter, smoothness, wander and curve in turn, until they do not
+change; the curve in `_minimize`), `accuracy_of` (its covariance) and `carried_over`. A curve that
+is too flat has its cause in `_smoothness`, a standard error in `accuracy_of`.
 """
 
 from typing import NamedTuple
@@ -29,32 +34,33 @@ from .errors import (
 from .model import Forecast, Intervals, Table, forecast, tabulated
 
 
-# Half waves of a curve. More: time, for detail that the smoothness removes. Fewer: curves that jump
-# are cut off.
+# Number of half waves of a curve. More: time, for detail that the smoothness removes. Fewer: jumps
+# of curves are smoothed away.
 WAVES = 20
-# Most Gauss-Newton steps, and most halvings of a step or updates of jitter, smoothness and
-# miscounted intervals. More: time. Fewer: fits end before convergence.
+# Largest number of Gauss-Newton steps; of halvings of a step; and of updates of jitter, smoothness
+# and miscounted intervals. More: time. Fewer: fits end before convergence.
 _STEPS = 30
 _ROUNDS = 8
 # Relative changes at convergence: of the cost, and of jitter and smoothness. Larger: estimates
 # depend on the start. Smaller: more iterations for digits that noise hides.
 _SETTLED = 1e-6
 _SAME = 0.01
-# The same of the cost while jitter and smoothness still change. Larger: more updates of them.
-# Smaller: digits that the next update changes.
+# Relative change of the cost at convergence, while jitter and smoothness still change. Larger: more
+# updates are needed. Smaller: iterations compute digits that the next update changes.
 _NEARLY_SETTLED = 1e-3
-# Blocks from which standard errors are computed: one per trial if there are so many, else parts of
-# trials with at least so many intervals. More, shorter: blocks are not independent. Fewer, longer:
-# standard errors scatter.
+# Standard errors are computed from this number of blocks: one for each trial if there are enough
+# trials, otherwise parts of trials with a least number of intervals. More or shorter blocks: they
+# are not independent. Fewer or longer: standard errors scatter.
 _BLOCKS = 30
 _SHORTEST_BLOCK = 10
 
 
-# Half waves whose coefficients may be as large as that of the first one. More: bands are wider.
-# Fewer: where the data determine little, bands are those of a curve that hardly turns in a cycle.
+# The coefficients of this number of half waves may be as large as the first one. More: bands are
+# wider. Fewer: if the data determine little, bands are those of a curve that hardly changes within
+# a cycle.
 _COARSE = 3.0
-# Logarithms of tau^2 that are compared, beyond that of the mean of its prior. Wider or finer: time.
-# Narrower: curves that are flatter than e^-8 of the prior's mean keep that shape.
+# Grid of values of log tau^2, relative to the mean of the prior. Wider or finer: time. Narrower:
+# curves flatter than e^-8 of the prior's mean are not possible.
 _LOG_SIZES = np.arange(-16.0, 4.5, 0.5)
 
 
@@ -71,7 +77,8 @@ class Smoothness(NamedTuple):
     """The prior of a curve."""
 
     penalty: Curve
-    """Addition to the curvature of the sum of squares; zero for the mean."""
+    """Penalty of each coefficient, added to the curvature of the sum of squares; zero for the mean
+    of the curve."""
     noise: float
     """Variance of the phase at the end of a cycle, s^2, times the excess."""
     excess: float
@@ -81,7 +88,7 @@ class Smoothness(NamedTuple):
     others: Float[np.ndarray, "T p"]
     """Penalties of other values of tau."""
     probability: Float[np.ndarray, " T"]
-    """Posterior probability of each."""
+    """Posterior probability of each value of tau."""
 
     @staticmethod
     def none(waves: int) -> "Smoothness":
@@ -122,7 +129,7 @@ class CurveFit(NamedTuple):
 
     @property
     def missed(self) -> Lanes:
-        """By how many cycles each interval misses its forecast."""
+        """Error of the forecast of each interval, in cycles."""
         return self.residual * self.forecast.rate
 
     def counted(self) -> Bool[np.ndarray, " L"]:
@@ -136,10 +143,10 @@ def fit_curve(
     waves: int,
     start: CurveFit | None = None,
 ) -> CurveFit:
-    """Return the curve of so many half waves that forecasts durations best (least squares), as
-    smooth as the marginal likelihood suggests.
+    """Return the curve with `waves` half waves that forecasts durations best (least squares), with
+    the smoothness of the largest marginal likelihood.
 
-    Intervals whose forecast is off by half a cycle or more were miscounted, and not used.
+    Intervals whose forecast is wrong by half a cycle or more were miscounted, and are not used.
     `start`: a fit with as many half waves or fewer.
     """
     fit = _start(intervals, waves, start)
@@ -160,7 +167,8 @@ def fit_curve(
 
 
 def _start(intervals: Intervals, waves: int, start: CurveFit | None) -> CurveFit:
-    """Return another fit with so many half waves, or, without one, the mean rate of each trial."""
+    """Return the fit `start` with `waves` half waves; without one, a flat curve with the mean rate
+    of each trial."""
     smoothness = Smoothness.none(waves)
     if start is not None:
         more = waves + 1 - len(start.coefficients)
@@ -197,7 +205,7 @@ def _wander(intervals: Intervals, fit: CurveFit) -> Wander:
 
 
 def whitened(intervals: Intervals, fit: CurveFit) -> Whitening:
-    """Return how the residuals of a fit become independent errors."""
+    """Return the filter that makes the residuals of a fit independent."""
     rates = fit.rates[intervals.trial]
     return whitening(intervals, fit.forecast, rates, fit.used, fit.wander)
 
@@ -273,7 +281,7 @@ class Projected(NamedTuple):
     across: Slopes
     """Derivatives with respect to the coefficients."""
     along: Float[np.ndarray, "trials p1"]
-    """What rates explain of the residuals, and of the derivatives."""
+    """Parts of the residuals and of the derivatives that the rates explain."""
 
 
 def projected(intervals: Intervals, fit: CurveFit, white: Whitening) -> Projected:
@@ -310,7 +318,7 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     weight = relative**2
     curvature = across.T @ across
     score = across.T @ errors.residual + curvature @ fit.coefficients
-    # The mean is free: its part is taken out.
+    # The mean of the curve is free: its part is projected out.
     of_mean = max(curvature[0, 0], _TINY)
     share = curvature[1:, 0] / of_mean
     by_first = np.outer(share, curvature[0, 1:])
@@ -362,7 +370,8 @@ def _noise(
 ) -> tuple[float, float]:
     """Return the variance of noise, and its excess in sums over blocks.
 
-    Noise is what no curve explains, however rough: what a smooth one leaves may be its shape.
+    Noise is the part that no curve explains, however rough. (Residuals of a smooth curve may
+    contain a part of its true shape.)
     """
     across = errors.across
     residual = errors.residual
@@ -389,14 +398,14 @@ def accuracy_of(intervals: Intervals, fit: CurveFit) -> tuple[Covariance, float,
     """Return the covariance of a curve, the sum of squared errors of intervals forecast by fits to
     other blocks, and the number of coefficients that the data determine.
 
-    The errors of each block are those of a forecast by a curve fitted to the other blocks, to first
-    order (the jackknife that deletes blocks: Bell and McCaffrey 2002). Smoothness makes a bias,
-    whose expected square is added (Nychka 1988: such intervals hold the curve at as many phases as
-    they claim).
+    The errors of a block are those of a forecast by a curve that is fitted to the other blocks, to
+    first order (delete-block jackknife: Bell and McCaffrey 2002). The expected square of the bias
+    by smoothing is added. (With it, intervals of 95 % contain the curve at 95 % of the phases on
+    average: Nychka 1988.)
     """
     errors = projected(intervals, fit, whitened(intervals, fit))
     across = errors.across
-    # The same of durations: differences to forecasts, in s.
+    # Errors of durations: differences from their forecasts, in s.
     of_rate = errors.along[intervals.trial, 1:]
     by_rates = of_rate * fit.by_rate[:, None]
     in_seconds = fit.forecast.slopes[:, :-1] - by_rates
@@ -447,7 +456,7 @@ def _covariance(fit: CurveFit, data: Square, meat: Square) -> Square:
 
 
 def fit_rates(intervals: Intervals, coefficients: Curve, jitter: float) -> CurveFit:
-    """Return the rate of each trial under a known curve, with the durations that both forecast."""
+    """Fit only the rate of each trial, for a known curve."""
     fit = _start(intervals, len(coefficients) - 1, None)
     fit = fit._replace(coefficients=coefficients, jitter=jitter)
     table = tabulated(len(coefficients) - 1, jitter)
@@ -476,15 +485,17 @@ def explained(intervals: Intervals, used: Bool[np.ndarray, " L"], left: float) -
 
 
 class Carried(NamedTuple):
-    """What a push does to the interval after its own, as part of the effect on its own."""
+    """The effect of a push on the interval after its own, relative to the effect on its own
+    interval."""
 
     part: float
     error: float
-    """Standard error; infinite if no two intervals follow each other."""
+    """Standard error; infinite if there are no two successive intervals."""
 
 
 def follows(intervals: Intervals, fit: CurveFit) -> Bool[np.ndarray, " L1"]:
-    """Return which intervals after the first begin where the one before ends, both used."""
+    """Return, for all intervals but the first, whether the interval begins where the one before
+    ends, and both are used."""
     end = intervals.start + intervals.duration
     pause = np.abs(intervals.start[1:] - end[:-1])
     same = np.diff(intervals.trial) == 0
@@ -495,8 +506,8 @@ def follows(intervals: Intervals, fit: CurveFit) -> Bool[np.ndarray, " L1"]:
 def carried_over(intervals: Intervals, fit: CurveFit) -> Carried:
     """Regress the residual of each interval on the fitted response of the interval before.
 
-    If a push acts in its own interval alone, the slope is zero (Lagrange multiplier test:
-    Breusch and Pagan 1980). The column is taken as what curve and rates do not explain.
+    If a push acts in its own interval only, the slope is zero (Lagrange multiplier test: Breusch
+    and Pagan 1980). The part of the regressor that curve and rates explain is removed first.
     """
     white = whitened(intervals, fit)
     response = fit.forecast.duration - 1 / fit.rates[intervals.trial]

@@ -3,14 +3,16 @@ r"""The phase model of an oscillator with a reset, from one event to the next.
 $$\dot\varphi = w + Z(\varphi)\, I(t), \qquad \varphi = 0 \text{ at an event}, \quad
 \text{the next one where } \varphi = 1.$$
 
-The end of an interval depends on the input, so the equation is integrated until the phase is 1,
-whenever that is, and never up to the measured end (whose noise would enter the regressors).
+The end of an interval depends on the input. So the equation is integrated until the phase is 1, and
+not until the measured end, whose noise would enter the regressors. `estimation.py` and
+`response.py` call `intervals_of` (data) and `forecast` (durations and their derivatives). If
+durations are wrong, look at `_PhaseModel.integrate`.
 
-Noise in the rhythm spreads the phase: after a part $\varphi$ of the cycle its variance is
-$s^2 \varphi$, with s the standard deviation at the end. The curve averaged over that distribution
-acts on the mean phase. A phase that has reached 1 has left the interval, and others may not have:
-the curve is continued beyond 1 by reflection. So it is a series of $\cos(\pi k \varphi)$, which
-need not be the same at 0 and at 1, and of which term k is weaker by
+Noise in the rhythm spreads the phase: after a part $\varphi$ of the cycle its variance is $s^2
+\varphi$, with s the standard deviation at the end. The curve averaged over that distribution acts
+on the mean phase. Near the end of an interval, a part of this distribution lies beyond 1, where the
+curve is continued by reflection. So the curve is a series of $\cos(\pi k \varphi)$, which need not
+have the same value at 0 and at 1. The average over the distribution reduces term k by the factor
 $\exp(-\pi^2 k^2 s^2 \varphi / 2)$.
 """
 
@@ -32,9 +34,9 @@ from ..smoothing import bridgeable, gaps, inside
 _STEPS = 32
 # Intervals that are integrated together. More: memory. Fewer: more calls of NumPy.
 _CHUNK = 4096
-# Points per cycle at which curves are tabulated, up to 1.5 cycles (the step in which an interval
-# ends goes beyond 1; inputs are kept for 1.5 of the longest interval), linear in between. More:
-# memory. Fewer: errors of the finest half wave (1e-5 of it at 1024).
+# Number of points per cycle at which curves are tabulated, with linear interpolation. Tables end at
+# 1.5 cycles, since the step in which an interval ends goes beyond 1. More: memory. Fewer: errors of
+# the finest half wave (1e-5 at 1024 points).
 _POINTS = 1024
 
 
@@ -46,10 +48,10 @@ Table = Float[np.ndarray, "M p"]
 
 
 class Intervals(NamedTuple):
-    """All intervals of a recording between events that nothing interrupts, trial by trial."""
+    """All uninterrupted intervals between events of a recording, trial by trial."""
 
     start: Float[np.ndarray, " L"]
-    """Start of each, in s."""
+    """Start of each interval, in s."""
     duration: Float[np.ndarray, " L"]
     trial: Int[np.ndarray, " L"]
     """Index among the trials that have intervals."""
@@ -64,8 +66,8 @@ class Intervals(NamedTuple):
 
 
 def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
-    """Return the intervals between events, with the input of that name, linear between samples,
-    without its mean in each trial.
+    """Return the intervals between events, with the input of that name. The input is linear between
+    samples, and its mean in each trial is subtracted.
 
     **Raises:** `DefinitionError` for a phase that is an angle or has other trials, an input that is
     missing or constant, and too few intervals during which it is finite.
@@ -94,7 +96,7 @@ def intervals_of(recording: Recording, phase: Phase, name: str) -> Intervals:
 
 
 def _joined(trials: Sequence[Intervals]) -> Intervals:
-    """Return the intervals of all trials; inputs that are shorter keep their last value."""
+    """Return the intervals of all trials. Inputs that end earlier keep their last value."""
     longest = max(len(x.inputs) for x in trials)
     inputs = [
         np.pad(x.inputs, ((0, longest - len(x.inputs)), (0, 0)), "edge") for x in trials
@@ -114,7 +116,8 @@ def _of_trial(
     stretches: Sequence[Winding],
     number: int,
 ) -> Intervals | None:
-    """Return the intervals of a trial during which its input x was sampled, if there are any."""
+    """Return those intervals of a trial during which its input x was sampled; None if there are
+    none."""
     nothing = np.zeros(0)
     starts = [w.time[:-1] for w in stretches]
     durations = [np.diff(w.time) for w in stretches]
@@ -197,7 +200,7 @@ class _Running(NamedTuple):
     """Intervals that have not ended yet, at the start of a step."""
 
     rows: Int[np.ndarray, " l"]
-    """Their places among all intervals."""
+    """Indices of these intervals among all."""
     step: Lanes
     rate: Lanes
     """Rates without input."""
@@ -263,7 +266,7 @@ class _PhaseModel:
             middle = inputs[2 * j + 1][now.rows]
             end = inputs[2 * j + 2][now.rows]
             phase, first, last = self._runge_kutta(now, middle, end)
-            # After the last step, a phase grows at its own rate.
+            # After the last step, a phase grows at its rate without input.
             ended = (phase >= 1) | (j == steps - 1)
             part = np.ones(len(phase))
             part[ended], per_step = _end(
@@ -346,10 +349,11 @@ def _end(
     last: Lanes,
     own: Lanes,
 ) -> tuple[Lanes, Lanes]:
-    """Return the part of a step at whose end the phase is 1, and the rate there per step.
+    """Return the part of a step after which the phase is 1, and the rate of the phase at this point
+    (per step).
 
-    It is the root of the cubic with the given phases and rates (per step) at both ends of the step.
-    Beyond the step, the phase grows at its `own` rate.
+    The part is the root of the cubic through the given phases and rates (per step) at both ends of
+    the step. Beyond the step, the phase grows at its `own` rate.
     """
     rise = after - before
     cubic = first + last - 2 * rise

@@ -1,7 +1,9 @@
-"""The phase response curve of a rhythm, from the times of its events under a known input.
+"""`phase_response`: the phase response curve of a rhythm, from the times of its events under a
+known input.
 
-`phase_response` fits a flat curve, then a smooth one (`estimation.py`), with the errors of
-intervals of `errors.py`. The phase model, which forecasts intervals, is in `model.py`.
+It fits a flat curve, then a smooth one (`estimation.py`), and returns a `PhaseResponse`. The phase
+model that forecasts intervals between events is in `model.py`, and the model of their errors in
+`errors.py`.
 """
 
 import equinox as eqx

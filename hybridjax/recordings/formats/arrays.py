@@ -1,5 +1,9 @@
-"""Files of named arrays (HDF5, NetCDF, MATLAB of all versions, NPZ) and of one table (Parquet,
-Feather, Excel)."""
+"""Readers of files of named arrays (HDF5, NetCDF, MATLAB of all versions, NPZ), and of files of one
+table (Parquet, Feather, Excel).
+
+`read.py` calls a function `read_...` by the suffix of a file; each returns tables of `Columns`
+(`columns.py`). In files with groups, `_read_tree` decides which array holds the times of a signal.
+"""
 
 import csv
 import io
@@ -31,10 +35,10 @@ from .matlab_sizes import declared
 from .text import read_plain
 
 
-# The rows of a sheet of Excel. Smaller: long recordings are refused. Larger: a row with a wrong
-# number takes memory for all rows before it.
+# Largest number of rows of a sheet of Excel. Smaller: long recordings are refused. Larger: a row
+# with a wrong number takes memory for all rows before it.
 _MOST_ROWS = 2**20
-# Attributes of NetCDF that change stored numbers: marks of missing ones, and a line.
+# Attributes of NetCDF that change stored numbers: marks of missing numbers, and a linear scale.
 _MARKS = ("_FillValue", "missing_value")
 _PACKING = (*_MARKS, "scale_factor", "add_offset")
 Place = tuple[str, ...]
@@ -50,7 +54,8 @@ class Leaf(NamedTuple):
     """Attributes of NetCDF (`scale_factor`, `_FillValue`, ...) that change the stored numbers."""
 
     def values(self) -> np.ndarray:
-        """Return the numbers that the stored ones stand for; NaN where they stand for none."""
+        """Return the numbers after unpacking; NaN where the stored number is a mark of a missing
+        one."""
         stored = np.asarray(self.array[()])
         if not self.packing:
             return stored
@@ -74,7 +79,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
 
     def visit(name: str, node: Any) -> None:
         place = tuple(name.split("/"))
-        if len(place) > limits.NESTED:  # (each is opened through all around it)
+        if len(place) > limits.NESTED:  # (opening one opens all groups around it)
             raise FileFormatError(
                 f"'{path}' has groups in more than {limits.NESTED} others: copy their arrays into "
                 "fewer."
@@ -85,7 +90,7 @@ def read_hdf5(path: Path, wanted: Wanted, separator: str = "/") -> list[Columns]
         kind = node.attrs.get("MATLAB_class")
         if h5py.check_ref_dtype(node.dtype) and kind is None:
             _refuse_structs(path, separator.join(place[:-1]), wanted)
-        # Letters of MATLAB are numbers; its empty arrays hold their shape.
+        # Texts of MATLAB are stored as numbers, and an empty array as its shape.
         is_text = "MATLAB_empty" in node.attrs or kind == b"char"
         if node.dtype.kind not in "fiu" or is_text:
             return
@@ -144,7 +149,7 @@ def read_matlab(path: Path, wanted: Wanted) -> list[Columns]:
         version, _ = matlab.matfile_version(path)
         if version == 2:
             return read_hdf5(path, wanted, ".")
-        # (`whosmat` unpacks whole arrays of version 5. Version 4 does not pack.)
+        # (`whosmat` of scipy unpacks whole arrays of version 5. Files of version 4 are not packed.)
         if version == 1:
             for size in itertools.accumulate(declared(path)):
                 check_declared(path, size)
@@ -313,8 +318,8 @@ def _rows(path: Path, sheet: Any) -> list[list[str]]:
 
     **Raises:** `FileFormatError` for a row that Excel does not have.
     """
-    # A sheet says how far its cells reach, and one with a blank would fill a million rows. Without
-    # this, rows end at their last cell.
+    # A sheet states its number of cells, which may be a million rows for a single blank. After the
+    # reset, rows end at their last cell.
     sheet.reset_dimensions()
     filled: dict[int, list[str]] = {}
     for number, row in enumerate(sheet.iter_rows(values_only=True)):
@@ -332,7 +337,8 @@ def _rows(path: Path, sheet: Any) -> list[list[str]]:
 
 
 def _line(cells: list[str], width: int) -> str:
-    """Join cells with tabs, in quotes where necessary, as many in each row that is not empty."""
+    """Join cells with tabs, in quotes where necessary. Rows that are not empty get `width`
+    cells."""
     if not cells:
         return ""
     filled = [*cells, *[""] * (width - len(cells))]

@@ -1,4 +1,7 @@
-"""Bags of ROS 1 and ROS 2, and MCAP files with messages of ROS."""
+"""Reader of bags of ROS 1 and ROS 2, and of MCAP files with messages of ROS.
+
+`read.py` calls `read_bag`, which returns one table of `Columns` for each wanted topic.
+"""
 
 import dataclasses
 from array import array
@@ -13,8 +16,8 @@ from ...errors import FileFormatError
 from .columns import Columns, Wanted, assumed, check_rows, reading
 
 
-# Longest array in a message whose numbers become signals. Longer: scans and images become thousands
-# of signals. Shorter: joint positions of a humanoid are left out.
+# Arrays in a message become signals up to this length. Longer: scans and images become thousands of
+# signals. Shorter: joint positions of a humanoid are left out.
 _LONGEST = 64
 
 

@@ -1,4 +1,9 @@
-"""C3D files: markers, analog channels, events."""
+"""Reader of C3D files: markers, analog channels, events.
+
+`read.py` calls `read_c3d`, which returns two tables of `Columns`: markers and analog channels. The
+bytes are decoded by ezc3d; the header is read here only to refuse files whose number of frames it
+cannot hold.
+"""
 
 import itertools
 import struct
@@ -59,7 +64,8 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
 
 
 def _declared_frames(path: Path) -> int | None:
-    """Return the number of frames in the header, which ezc3d corrects; None beyond 16 bits."""
+    """Return the number of frames that the header states (ezc3d returns a corrected number); None
+    if it needs more than 16 bits."""
     with open(path, "rb") as file:
         head = file.read(10)
         # The type of the processor, in the parameters.
@@ -104,7 +110,7 @@ def _points(
     labels = _texts(parameters, "LABELS")
     usual = (_texts(parameters, "UNITS") or [""])[0]
     units = dict.fromkeys(labels, usual)
-    # Modeled quantities stand among the markers, with units of their own.
+    # (Modeled quantities are stored among the markers, with units of their own.)
     for kind in ("ANGLE", "FORCE", "MOMENT", "POWER", "SCALAR"):
         unit = (_texts(parameters, f"{kind}_UNITS") or [usual])[0]
         units |= dict.fromkeys(_texts(parameters, f"{kind}S"), unit)

@@ -1,4 +1,10 @@
-"""The interface of all readers of files: which columns are wanted, and which were read."""
+"""The interface of all readers of files: which columns are wanted (`Wanted`), and which were read
+(`Columns`).
+
+A reader gets a path and a `Wanted`, and returns a list of `Columns`: one for each table whose
+signals share their times. `parse_table` then separates times, events and signals, and finds units
+in headers. `reading` turns errors of libraries into a `FileFormatError`.
+"""
 
 import errno
 import functools as ft
@@ -56,7 +62,7 @@ class Table(NamedTuple):
     """The columns of a table by their plain names."""
 
     time: Float[np.ndarray, " n"]
-    """In s."""
+    """Times in s."""
     signals: dict[str, Float[np.ndarray, " n"]]
     units: dict[str, str]
     """Units of the signals that have one."""
@@ -164,8 +170,8 @@ class Wanted(NamedTuple):
         return not _with_groups(name).isdisjoint(_set(self.signals))
 
     def reaches(self, group: str) -> bool:
-        """Return whether a signal, its group, or one of its members is wanted: `imu` is reached by
-        `imu.gyro.x`, and `imu.gyro.x` by `imu`."""
+        """Return whether a signal, a group that contains it, or a member of it is wanted: `imu` is
+        reached if `imu.gyro.x` is wanted, and `imu.gyro.x` if `imu` is wanted."""
         if self.signals is None:
             return True
         within = not _with_groups(group).isdisjoint(_set(self.signals))
@@ -193,13 +199,13 @@ class Wanted(NamedTuple):
 
 
 def _with_groups(name: str) -> set[str]:
-    """The name of a signal, and those of the groups that it is in: `imu.gyro.x`, `imu.gyro` and
-    `imu`."""
+    """The name of a signal, and the names of the groups that contain it: `imu.gyro.x`, `imu.gyro`
+    and `imu`."""
     groups = {name[:k] for k, letter in enumerate(name) if letter in "./"}
     return {name, *groups}
 
 
-# Names are compared as sets, since a file may have thousands, and a user want as many.
+# (As sets, since a file may have thousands of names.)
 @ft.lru_cache(maxsize=8)
 def _set(names: tuple[str, ...]) -> frozenset[str]:
     return frozenset(names)
@@ -252,9 +258,9 @@ def reading(path: Path, kind: str) -> Iterator[None]:
     """Turn errors of a library about broken bytes into a `FileFormatError` with the library's
     own text.
 
-    Libraries stumble over broken bytes in any way, so that an error of any kind that one of their
-    lines raises is about the file, unless it is about the computer. Errors that lines of this
-    package raise are its own.
+    Libraries raise errors of any kind for broken bytes. So every error that is raised in a library
+    is taken to be about the file, unless it is about the computer (such as missing memory). Errors
+    that this package raises are not changed.
     """
     try:
         yield
@@ -270,7 +276,7 @@ def reading(path: Path, kind: str) -> Iterator[None]:
         ) from error
 
 
-# Errors of the system that say nothing about the content of a file.
+# Errors about the computer, not about the content of a file.
 _OF_SYSTEM = (
     errno.EACCES,
     errno.EIO,

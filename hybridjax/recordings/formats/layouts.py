@@ -1,7 +1,8 @@
 """Text files with or without the layouts of OpenSim, Motion Analysis and Vicon.
 
-`read_text` recognizes a layout by its first lines. A layout of another maker is a function here
-that returns its tables, and a line in `read_text`.
+`read.py` calls `read_text`, which returns tables of `Columns`. It recognizes a layout by its first
+lines; fields and numbers are read in `text.py`. To add a layout, write a function here that returns
+its tables, and call it in `read_text`.
 """
 
 from collections.abc import Iterator
@@ -109,7 +110,8 @@ def _vicon(path: Path, lines: list[str], wanted: Wanted) -> Iterator[Columns]:
 
 
 def _place(path: Path, table: Columns) -> tuple[int, Float[np.ndarray, " n"]]:
-    """Take the numbers of frames out of a table; return samples in a frame, and since the first."""
+    """Take the columns of frame numbers out of a table. Return the number of samples in a frame,
+    and for each row the number of samples since the first."""
     columns = {name.lower(): name for name in table.values}
     frame = table.values.pop(columns["frame"])
     within = np.zeros(len(frame))
@@ -127,7 +129,8 @@ def _names(devices: list[str], components: list[str], units: list[str]) -> list[
     device = ""
     names = []
     for above, component, unit in zip_longest(devices, components, units, fillvalue=""):
-        # A name stands above the first of its columns; of `subject:marker` the marker counts.
+        # A name stands above the first of its columns. Of `subject:marker`, the part after the
+        # colon is used.
         if above:
             device = above.split(":")[-1]
         name = f"{device}.{component}" if device else component

@@ -1,4 +1,7 @@
-"""How much memory a MATLAB file of version 5 declares, from the headers of its arrays alone.
+"""How much memory the arrays of a MATLAB file of version 5 need, from their headers alone.
+
+`arrays.py` sums the sizes from `declared` before scipy reads the file, so that a damaged or
+malicious file is refused before memory is taken.
 
 A file is a list of elements: a tag (type, bytes) and its data. Arrays are elements that begin with
 their flags, sizes and names; members of structs and cells are arrays in them. A compressed element
@@ -25,10 +28,10 @@ _STRUCT = 2
 _OBJECT = 3
 # Classes of arrays: text, double, single, and whole numbers of 8 to 64 bits.
 _TEXT_AND_NUMBERS = (4, *range(6, 16))
-# Bytes that count for an empty member. Smaller: small files of millions of empty members take
-# minutes and memory that is not counted. Larger: files with many small arrays are refused.
+# Number of bytes that an empty member counts. Smaller: small files of millions of empty members
+# take minutes and memory. Larger: files with many small arrays are refused.
 _MEMBER = 1024
-# Bytes that are decompressed at once. Smaller: calls take the time. Larger: memory is taken before
+# Number of bytes that are decompressed at once. Smaller: more calls. Larger: memory is taken before
 # sizes are known.
 _PIECE = 2**16
 
@@ -149,7 +152,8 @@ def declared(path: Path) -> Iterator[int]:
 
 
 def _array(path: Path, source: _Reader, size: int, depth: int) -> Iterator[int]:
-    """Yield the sizes of an array, of which the tag has been read, and of its members."""
+    """Yield the sizes of an array and of its members. (The tag of the array has been read
+    already.)"""
     if depth > limits.NESTED:
         raise FileFormatError(
             f"'{path}' has arrays in more than {limits.NESTED} structs or cells: save them in "

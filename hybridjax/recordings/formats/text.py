@@ -1,4 +1,10 @@
-"""Tables in text files: encodings, separators, names, units, numbers."""
+"""Tables in text files: encodings, separators, names, units, numbers.
+
+`layouts.py` calls `read_lines` for the lines of a file, and `read_plain` (a file without a special
+layout) or `read_table` (numbers from a given line on), which return `Columns`. A number that is
+misread has its cause in `_by_line` or `_numbers_alone`, a wrong name in `_separator` or
+`_from_names`.
+"""
 
 import codecs
 import csv
@@ -18,7 +24,7 @@ from ...errors import FileFormatError
 from .columns import EVENT, Columns, Wanted, assumed, is_unit, split_header, two_columns
 
 
-# Bytes that no text holds, in any encoding with one byte for each ASCII character.
+# Bytes that do not occur in texts, in any encoding with one byte for each ASCII character.
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\v\f\r\x1a\x1b"))
 _COMMENTS = ("#", "%", "//")
 # Marks of a missing sample, in any case of letters.
@@ -58,7 +64,7 @@ def read_lines(path: Path) -> list[str]:
 def _byte_of_latin_1(error: UnicodeError) -> tuple[str, int]:
     """Return the letters that bytes are in Latin-1, and where decoding goes on.
 
-    One letter of another program, as in a comment, thus leaves the names in UTF-8 as they are.
+    (A single such letter, as in a comment, then does not change the rest of the file.)
     """
     if not isinstance(error, UnicodeDecodeError):
         raise error
@@ -237,7 +243,7 @@ def read_table(
 
 
 def _about_texts(headers: Sequence[str], columns: Iterable[int]) -> Finding:
-    """The finding that these columns were left out, as they are texts alone."""
+    """The finding that some columns were left out, since they have texts only."""
     names = ", ".join(f"'{headers[k]}'" for k in columns)
     return assumed(f"columns of text were left out: {names}.")
 

@@ -1,4 +1,11 @@
-"""Do the outputs answer each input, alike in all parts of a recording, and was it exogenous?"""
+"""Checks of inputs: do the outputs respond to each input, alike in all parts of a recording, and
+was the input exogenous?
+
+`inspect.py` calls three functions, which yield findings: `unanswered` (predicts each cycle, see
+there), `inexact_events` and `feedback`. In this file, an *answer* is the response of the outputs to
+an input within one part of a recording, and its *gain* the ratio of the actual to the predicted
+response.
+"""
 
 from collections.abc import Iterator, Sequence
 from itertools import compress, pairwise
@@ -12,19 +19,21 @@ from ..data import SectionData, whole_cycles
 from ..findings import CLEAR, NAME_REFERENCE, place
 
 
-# Numbers of outputs per cycle that are predicted: the first for which there are `_ENOUGH` cycles
-# per unknown. More cycles: short recordings are not checked. Fewer: predictions are noise.
+# Possible numbers of sections per cycle whose outputs are predicted. The first one with `_ENOUGH`
+# cycles per unknown is taken. More cycles: short recordings are not checked. Fewer: predictions are
+# noise.
 _SECTIONS = (8, 4, 2)
 _ENOUGH = 3
-# Cycles of a part, at least, and parts of a record, at most. More: short faults are diluted, or
-# long records take longer. Fewer: the gain of a part is noise.
+# Least number of cycles of a part, and largest number of parts of a record. More cycles: short
+# faults are diluted. More parts: long records take longer. Fewer cycles: the gain of a part is
+# noise.
 _SHORTEST = 16
 _PARTS = 4
-# Unexplained power of a part relative to the median that makes a disturbance. Larger: stumbles
+# A part is disturbed if its unexplained power exceeds this multiple of the median. Larger: stumbles
 # pass. Smaller: noisy parts are reported.
 _DISTURBED = 9.0
-# Part of the outputs' variance that errors of event times explain. Larger: inexact events pass.
-# Smaller: real deviations along the cycle are called errors.
+# Events are inexact if errors of their times would explain more than this part of the outputs'
+# variance. Larger: inexact events pass. Smaller: real deviations along the cycle count as errors.
 _SHIFTED = 0.7
 
 _TEXTS = {
@@ -48,7 +57,7 @@ class _Part(NamedTuple):
     before: Signals
     """Outputs of the cycle before the predicted one."""
     inputs: list[Signals]
-    """Means of each input over parts of the cycles around the predicted one."""
+    """Means of each input over parts of cycles: of the predicted cycle and its neighbors."""
     outputs: Signals
     """Outputs of the predicted cycle."""
 
@@ -60,22 +69,22 @@ class _Answer(NamedTuple):
     """The response of the outputs to an input in one part."""
 
     gain: float
-    """Relative to that learned from other parts."""
+    """Gain: the actual response relative to the response that is predicted from other parts."""
     error: float
     """Standard error of the gain."""
     left: float
     """Mean square of the residuals."""
     explained: float
-    """Mean square of the learned response."""
+    """Mean square of the predicted response."""
 
 
 def unanswered(data: SectionData, names: Sequence[str]) -> Iterator[Finding]:
     """Find inputs that the outputs do not answer, in all trials or in parts of them.
 
-    Each cycle is predicted linearly from the one before and from the inputs, as learned from the
-    other trials (or the other parts of a single one). The gain of a part is the ratio of actual to
-    predicted response: about 1, but 0 for the input of another trial, -1 for the other sign.
-    Standard errors come from the residuals, cycle by cycle.
+    Each cycle is predicted linearly from the cycle before and from the inputs. The coefficients are
+    learned from the other trials (or from the other parts of a single trial). The gain of a part is
+    the ratio of actual to predicted response: about 1, but 0 for the input of another trial, -1 for
+    the other sign. Standard errors come from the residuals, cycle by cycle.
 
     **Arguments:** `names`: names of the trials.
     """
@@ -102,7 +111,8 @@ def _odd(
     where: Sequence[str],
     several: bool,
 ) -> Iterator[Finding]:
-    """Find odd gains of an input; `where`: places of the parts. `several`: it is not alone."""
+    """Find odd gains of an input. `where`: phrases for the places of the parts. `several`: whether
+    there are other inputs."""
     gain, error, left, explained = np.array(answers).T
     weight = error**-2.0
     together = abs(weight @ gain) / np.sqrt(weight.sum())
@@ -127,13 +137,13 @@ def _odd(
     for cause, parts in causes.items():
         if parts.any():
             text = _TEXTS[cause].format(name, listed(list(compress(where, parts))))
-            # The sign is a slip that spoils every estimate; the others may be few strides.
+            # (A wrong sign spoils every estimate; other odd gains may be a matter of few strides.)
             yield Finding(cause, text, "refused" if parts is turned else "warned")
 
 
 def _answers(parts: Sequence[_Part], i: int) -> list[_Answer]:
-    """Return the answers to input i, learned for each part from other trials (or, of a single
-    trial, from its other parts). Too few: none."""
+    """Return the answer to input i in each part. The prediction is learned from other trials, or
+    from other parts of a single trial; without enough of these, the list is empty."""
     regressors = [part.regressors() for part in parts]
     squares = [x.T @ x for x in regressors]
     products = [x.T @ p.outputs for x, p in zip(regressors, parts, strict=True)]
@@ -147,7 +157,7 @@ def _answers(parts: Sequence[_Part], i: int) -> list[_Answer]:
             return []
         square = np.sum([squares[k] for k in training], axis=0)
         product = np.sum([products[k] for k in training], axis=0)
-        # Inputs may be collinear.
+        # (A ridge, since inputs may be collinear.)
         ridge = 1e-4 * np.trace(square) / unknowns
         b = np.linalg.solve(square + ridge * np.eye(unknowns), product)
         answers.append(_answer(part, i, b))
@@ -220,13 +230,13 @@ def _robust_size(data: SectionData) -> Float[np.ndarray, " ny"]:
 
 
 def _centered(x: Signals) -> Signals:
-    """Subtract the means: each part has a level of its own."""
+    """Subtract the means, since the level of a signal may differ between parts."""
     return x - x.mean(axis=0)
 
 
 def inexact_events(data: SectionData) -> Iterator[Finding]:
-    """Find events whose times scatter: outputs after them deviate along the average cycle, by times
-    that do not depend on those of the events before."""
+    """Find events whose times are inexact: outputs after an event are shifted along the average
+    cycle by a time that does not depend on the shifts after earlier events."""
     N = data.n_sections
     size = data.rms()[1]
     tiny = np.finfo(float).tiny
@@ -250,7 +260,7 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
     late = np.concatenate(times)
     products = abs(late[1:] @ late[:-1])
     follows = products / max(late @ late, tiny)
-    # (Times beyond a cycle are those of outputs that do not change along it.)
+    # (Times of more than a cycle come from outputs that hardly change along the cycle.)
     if left < (1 - _SHIFTED) * whole and follows < 0.5 and late.std() < 1:
         yield Finding(
             "inexact events",
@@ -260,13 +270,15 @@ def inexact_events(data: SectionData) -> Iterator[Finding]:
 
 
 def feedback(data: SectionData) -> Iterator[Finding]:
-    """Find inputs that repeat with the rhythm, or whose average cycle is shaped as the outputs'.
+    """Find inputs that repeat with the rhythm, or whose average cycle has the shape of an output's
+    average cycle.
 
-    An input chosen without regard to the rhythm averages out over many cycles. One whose average
-    cycle holds most of its variance was made from the rhythm's phase or state, by a controller or a
-    trigger: its deviations then depend on those of the outputs, and on their disturbances, and no
-    regression on it is unbiased (Söderström and Stoica, *System Identification*, 1989, ch. 10:
-    direct identification in closed loop). The same holds if an output leaks into the input.
+    The average cycle of an input that is chosen without regard to the rhythm is nearly zero. If the
+    average cycle has most of the input's variance, the input was made from the rhythm's phase or
+    state, by a controller or a trigger. Its deviations then depend on the outputs and their
+    disturbances, so that every regression on it is biased (Söderström and Stoica, *System
+    Identification*, 1989, ch. 10: direct identification in closed loop). The same holds if an
+    output leaks into the input.
     """
     if data.cycles < 6:
         return

@@ -1,4 +1,9 @@
-"""Trials that differ from the others in units, columns, clocks or cycles, and slow changes."""
+"""Checks that compare trials: units, columns, clocks, cycles; and slow changes.
+
+`inspect.py` calls the functions without underscore; each yields findings. Most of them compare a
+number of one trial (range, period, correlation of average cycles) with the median of the other
+trials. The constants are their limits.
+"""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -17,35 +22,44 @@ from ..sampling import cycle_means
 from ..smoothing import Series
 
 
-# Factor within which ranges of two signals are alike, and a ratio is a power of ten. Larger: other
-# gains are taken for units. Smaller: swapped columns of signals whose range varies pass.
+# Ranges of two signals are alike if their ratio is below this factor; a ratio is a power of ten if
+# it differs from one by less than this factor. Larger: other gains are taken for units. Smaller:
+# swapped columns of signals whose range varies pass.
 _ALIKE = 1.2
-# Least offset of another zero in offsets of the other trials, which is also the least fraction of a
-# range. Larger: offsets pass. Smaller: scatter between trials is reported.
+# A trial has another zero if its offset exceeds this multiple of the offsets of other trials, and a
+# part of the range. Larger: offsets pass. Smaller: scatter between trials is reported.
 _OFF = 10.0
-# Least correlation of average cycles that are alike, each of so many values. Larger: noisy cycles
-# differ. Smaller: other events and swapped signals pass.
+# Average cycles of two trials (tables of a number of values) are alike if their correlation exceeds
+# this. Larger: noisy cycles are reported as different. Smaller: trials with other events or swapped
+# signals pass.
 _CORRELATED = 0.8
 _PHASES = HARMONICS // 2
-# Relative difference of periods of trials. Larger: other speeds pass. Smaller: jitter is reported.
+# A trial has another period if the relative difference exceeds this. Larger: other speeds pass.
+# Smaller: jitter is reported.
 _OTHER_PERIOD = 0.02
-# Fewest cycles that have a usual duration. Larger: short trials are not judged. Smaller: chance is.
+# Least number of cycles for which a usual duration is defined. Larger: short trials are not tested.
+# Smaller: chance is reported.
 _STRETCH = 8
-# Difference from the median duration of cycles that makes an odd one, in medians of differences and
-# in periods. Larger: lost samples pass. Smaller: variable rhythms are reported.
+# A cycle is odd if its duration differs from the median by more than this, in medians of such
+# differences, and by a part of the period. Larger: lost samples pass. Smaller: variable rhythms are
+# reported.
 _ODD = 12.0
 _ALIKE_PERIODS = 0.05
-# Fewest steps of time from which a grid of stamps is found, most different ones, and the least grid
-# in steps. Larger grid: errors of a fifth of a step pass. Smaller: stamps in ms are reported.
+# Time stamps are coarse if the times between samples are multiples of a *grid* (the resolution of
+# the clock). This is tested with at least `_STAMPS` samples, of which at most `_MOST_STEPS`
+# different times between samples exist, and if the grid is at least the part `_COARSE` of the usual
+# time between samples. Larger part: errors of a fifth of this time pass. Smaller: stamps in ms are
+# reported.
 _STAMPS = 50
 _MOST_STEPS = 6
 _COARSE = 0.2
-# Part of the variance of durations, or of outputs, that changes sign from cycle to cycle if two
-# kinds of cycles alternate. Larger: alternating steps pass. Smaller: multipliers of -0.9 are
-# reported in short recordings.
+# Two kinds of cycles alternate if more than this part of the variance of durations or outputs
+# changes its sign from cycle to cycle. Larger: alternating steps pass. Smaller: multipliers of -0.9
+# are reported in short recordings.
 _ALTERNATING = 0.5
-# Drift: number of cosines over a trial, and the ratio of the mean power of the slowest quarter to
-# that of the others. Larger: drift passes. A ratio below 14: a multiplier of 0.9 is reported.
+# The means over cycles are decomposed into `_COSINES` cosines over a trial. An output drifts if the
+# mean power of the slowest quarter of these exceeds `_RATIO` times that of the others. Larger:
+# drift passes. A ratio below 14: a multiplier of 0.9 is reported.
 _COSINES = 24
 _RATIO = 20.0
 
@@ -105,11 +119,11 @@ def _swapped(
     usual: Float[np.ndarray, " k"],
     usual_width: Float[np.ndarray, " k"],
 ) -> Bool[np.ndarray, "k k"]:
-    """Return which pairs of signals are each where the other one usually is, and not where they
-    usually are themselves."""
+    """Return which pairs of signals have changed places: each has the usual range of the other one,
+    and not its own."""
     narrower = np.minimum(width[:, None], usual_width)
     wider = np.maximum(width[:, None], usual_width)
-    # alike[i, j]: signal i is where signal j usually is.
+    # alike[i, j]: signal i has the usual range of signal j.
     alike = np.abs(middle[:, None] - usual) < narrower
     alike &= narrower * _ALIKE > wider
     at_home = np.diag(alike)
@@ -117,7 +131,8 @@ def _swapped(
 
 
 def _is_unit(ratio: float, is_output: bool) -> bool:
-    """Return whether a ratio is one of two units, up or down."""
+    """Return whether a ratio of ranges is that of two usual units (such as m and mm), in either
+    order."""
     units = [1e3, 1e6]
     if is_output:  # pushes may be chosen to be ten times as strong
         units += [10, 180 / np.pi, 1e2]
@@ -163,7 +178,7 @@ def clocks(recording: Recording) -> Iterator[Finding]:
 
 
 def coarse_stamps(recording: Recording, names: Sequence[str]) -> Iterator[Finding]:
-    """Find times that are multiples of a step which is not that of the samples."""
+    """Find times that are multiples of a coarse step, which is not the time between samples."""
     for trial in recording.trials:
         for name in names:
             x = trial.values[:, recording.column(name)]
@@ -182,13 +197,13 @@ def coarse_stamps(recording: Recording, names: Sequence[str]) -> Iterator[Findin
 
 
 def _grid_of(step: Series) -> float | None:
-    """Return the number of which all steps between samples are multiples, if they differ by it and
-    it is a large part of them."""
+    """Return the grid of which all times between samples are multiples; None if there is none, or
+    if it is much smaller than these times."""
     if len(step) < _STAMPS:
         return None
     usual = float(np.median(step))
     differing = np.abs(step / usual - 1) > _COARSE / 2
-    # Single steps are lost samples.
+    # (A few long steps are lost samples.)
     if differing.mean() < _COARSE / 2:
         return None
     ascending = np.sort(step)
@@ -199,7 +214,7 @@ def _grid_of(step: Series) -> float | None:
     grid = float(rises[is_rise].min())
     count = step / grid
     off = np.abs(count - np.round(count)).max()
-    # Steps of once and twice the usual one are those of lost samples, too.
+    # (Steps of once and twice the usual one also come from lost samples.)
     is_multiple = abs(grid / usual - 1) < _COARSE / 2
     if off > 0.05 or is_multiple or grid < _COARSE * usual:
         return None
@@ -260,7 +275,8 @@ def alternating_cycles(
 
 
 def _alternating(parts: Sequence[Cycles]) -> float:
-    """Return the part of the variance between cycles that changes its sign from one to the next.
+    """Return the part of the variance between cycles that changes its sign from each cycle to the
+    next.
 
     **Arguments:** `parts`: values of successive cycles, a row for each, without a gap.
     """
@@ -292,7 +308,7 @@ def other_cycles(
     if len(known) < 2:
         return
     for s in known:
-        # A trial among three or more does not move their median far.
+        # (In three or more trials, the trial itself hardly changes the median.)
         peers = known if len(known) > 2 else known[known != s]
         usual = np.median(mean[:, peers], axis=1)
         yield from _difference(mean[:, s], usual, names[s], outputs)
@@ -316,7 +332,7 @@ def _other_periods(phase: Phase, names: Sequence[str]) -> Iterator[Finding]:
 
 
 def _average_cycles(recording: Recording, phase: Phase, name: str) -> Cycles:
-    """Return the mean of a signal at each phase, without the mean of all, for each trial."""
+    """Return the average cycle of a signal in each trial, less its mean."""
     cycles = []
     for trial, x, parts in phase.samples(recording, name):
         at = np.full(len(x), np.nan)
@@ -336,7 +352,7 @@ def _difference(
     name: str,
     outputs: Sequence[str],
 ) -> Iterator[Finding]:
-    """Find the cause of a low correlation of the average cycles of a trial with those of others."""
+    """Find the reason why the average cycles of a trial differ from those of other trials."""
 
     def correlations(x: Cycles) -> Float[np.ndarray, " k"]:
         squares = (x**2).sum(axis=1) * (usual**2).sum(axis=1)
@@ -407,8 +423,8 @@ def slow_changes(
     outputs: tuple[str, ...],
     removed: float,
 ) -> Iterator[Finding]:
-    """Find means over cycles that change much more slowly than they scatter, where changes slower
-    than some cycles have been `removed`."""
+    """Find outputs whose means over cycles change slowly, by much more than they scatter.
+    `removed`: number of cycles; changes slower than this have been removed already."""
     for name in outputs:
         power = np.zeros(_COSINES)
         for trial, x, parts in phase.samples(recording, name):

@@ -1,4 +1,8 @@
-"""Samples that were not measured: placeholders, frozen, clipped and wrapped signals, copies."""
+"""Find samples that were not measured: placeholders, frozen, clipped and wrapped signals, copies.
+
+`inspect.py` calls the functions without underscore. Some return masks of samples, which are then
+left out; the others yield findings. The constants are their limits.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
@@ -12,26 +16,28 @@ from ..recording import Recording
 from ..smoothing import RANGES, Series
 
 
-# Shortest failure of a sensor: in cycles, in samples, and (where plateaus belong to the rhythm) in
-# plateaus. Longer: failures pass. Shorter: slow phases of the motion are left out.
+# A sensor has failed if its value stays the same for longer than this: in cycles, in samples, and,
+# if plateaus belong to the rhythm, in multiples of their median length. Longer: failures pass.
+# Shorter: slow phases of the motion are left out.
 _FROZEN_CYCLES = 0.25
 _FROZEN_SAMPLES = 10
 _FROZEN_PLATEAUS = 4
-# Least fraction of samples on plateaus at an extreme that is clipping, and its ratio to those on
-# other plateaus. Larger: clipping passes. Smaller: rounded or resting signals are reported.
+# A signal is clipped if more than this part of its samples lies on plateaus at an extreme, and many
+# more than on other plateaus. Larger: clipping passes. Smaller: rounded or resting signals are
+# reported.
 _CLIPPED = 0.005
 _MOSTLY = 5
-# Relative difference of the number of levels from a power of two that is an overflow. Larger:
-# impacts of a signal in integers are refused. Smaller: overflows of fast signals pass.
+# Jumps are overflows if the number of levels differs from a power of two by less than this part.
+# Larger: impacts of a signal in integers are refused. Smaller: overflows of fast signals pass.
 _ALL_LEVELS = 0.01
-# Fraction of equal samples that makes two signals, or two trials, copies. Larger: copies with a few
-# edited samples pass. Smaller: signals that rest at zero together are copies.
+# Two signals, or two trials, are copies if more than this part of their samples is equal. Larger:
+# copies with a few edited samples pass. Smaller: signals that rest at zero together are copies.
 _EQUAL = 0.99
-# Difference of equal samples in standard deviations. Larger: similar cycles of a regular rhythm
-# match. Smaller: copies written with fewer digits pass.
+# Samples are equal if they differ by less than this, in standard deviations. Larger: similar cycles
+# of a regular rhythm match. Smaller: copies written with fewer digits pass.
 _SAME = 1e-3
-# Samples in a window, and windows, that two copies share at least. More: short copies pass. Fewer:
-# equal samples by chance are copies.
+# Number of samples in a window, and least number of windows that two copies share. More: short
+# copies pass. Fewer: equal samples by chance are copies.
 _WINDOW = 8
 
 Samples = Float[np.ndarray, "n k"]
@@ -60,7 +66,7 @@ def _is_placeholder(size: float) -> bool:
 
 
 def frozen(x: Series, period: float, is_input: bool) -> Rows:
-    """Find a sensor that stays at one value for longer than its rhythm allows.
+    """Find samples at which a sensor stays at one value for longer than the rhythm allows.
 
     `period`: rough duration of a cycle, in samples. Inputs may rest at zero, and inputs that rest
     in most cycles are held.
@@ -68,7 +74,7 @@ def frozen(x: Series, period: float, is_input: bool) -> Rows:
     first, length = _runs(x)
     plateaus = length[length >= 3]
     limit = max(_FROZEN_CYCLES * period, _FROZEN_SAMPLES)
-    # Plateaus in most cycles belong to the rhythm, as those of a foot on the ground.
+    # Plateaus in most cycles belong to the rhythm, such as those of a foot on the ground.
     in_most_cycles = len(plateaus) > 0.5 * len(x) / period
     if in_most_cycles and is_input:
         return np.zeros(len(x), bool)
@@ -110,18 +116,19 @@ def clipped(recording: Recording, name: str) -> Iterator[Finding]:
 
 
 def wrapped(recording: Recording, name: str) -> Iterator[Finding]:
-    """Find integers that overflow: jumps up and down by half of their levels, a power of two."""
+    """Find integers that overflow: the number of levels is a power of two, and the signal jumps up
+    and down by more than half of this number."""
     for trial, x in recording.samples(name):
         levels = np.unique(x[np.isfinite(x)])
         if len(levels) < 2:
             continue
         step = float(np.diff(levels).min())
         count = (x - levels[0]) / step
-        # Whole numbers, but for rounding.
+        # (Whole numbers up to rounding.)
         if np.nanmax(np.abs(count - np.round(count))) >= 1e-3:
             continue
         whole = 1 + round(float(np.nanmax(count)))
-        # (Of many levels, the outermost are not met.)
+        # (If there are many levels, the outermost ones do not occur.)
         bits = round(np.log2(whole))
         jumps = np.diff(count) / 2.0**bits
         up_and_down = (jumps > 0.5).any() and (jumps < -0.5).any()
@@ -174,8 +181,8 @@ def repeated_rows(
 ) -> tuple[list[Rows], list[Finding]]:
     """Return for each trial the samples that an earlier trial holds already.
 
-    Windows of successive samples are compared first. If most of those that two trials share are at
-    the same distance, both trials are compared sample by sample.
+    Windows of successive samples are compared first. If two trials share windows, most of them at
+    the same distance in time, the two are compared sample by sample.
     """
     columns = [recording.column(name) for name in names]
     trials = recording.trials
@@ -216,7 +223,8 @@ def _keys(values: Samples) -> Float[np.ndarray, " m"]:
 
 
 def _shift(x: Float[np.ndarray, " m"], y: Float[np.ndarray, " m"]) -> int | None:
-    """Return the distance at which two trials share most of their common windows, if they do."""
+    """Return the distance (in samples) at which two trials share most of their common windows; None
+    if there is none."""
     _, first, second = np.intersect1d(x, y, return_indices=True)
     if not len(first):
         return None
@@ -232,7 +240,8 @@ def _same_rows(
     shift: int,
     tolerance: Float[np.ndarray, " k"],
 ) -> Rows:
-    """Return the rows of y that are in x, so many rows later; all, if nearly all are."""
+    """Return the rows of y that equal rows of x, shifted by a number of rows. If nearly all are
+    equal, return all."""
     same = np.zeros(len(y), bool)
     first = max(0, shift)
     last = min(len(x), len(y) + shift)

@@ -1,4 +1,10 @@
-"""Look for what is wrong with a recording, before its phase is known and after."""
+"""`check_recording`: look for errors in a recording before anything is computed from it.
+
+It calls the tests in `failures.py`, `differences.py` and `answers.py`, and returns an `Inspection`:
+findings, and the recording without samples that were certainly not measured. `inspect_cycles` runs
+the tests that need the phase and the data at the sections. A new test is a function in one of these
+files, and a line here.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

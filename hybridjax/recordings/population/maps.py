@@ -1,8 +1,9 @@
 """`PopulationMaps`: curves and maps of several subjects, their mean, and tests of differences.
 
-If there is no difference, the largest |t| over a map has the distribution of the largest |t| of
-maps that are drawn from the measured ones. Its quantiles give p-values and bands that hold the
-family-wise error at each point (Nichols and Holmes, Human Brain Mapping 15, 2002). The draws are
+The tests use the largest |t| over a map. If there is no difference, its distribution is that of the
+largest |t| over maps that are drawn from the measured ones. The quantiles of this distribution give
+p-values for each point, and bands, with a family-wise error over all points (Nichols and Holmes,
+Human Brain Mapping 15, 2002). The draws are
 
 - sign flips of paired differences, which are symmetric if there is no difference (exact), and of
   deviations from a mean;
@@ -27,26 +28,26 @@ from ..._core.boundary.checked import checked
 from ..._core.boundary.kinds import Count, Seed, Vector
 from ..._core.boundary.values import Complexes
 from ..._core.showable import Showable
-from ..._core.text import p_value
+from ..._core.text import number, p_value
 from .tables import Columns, require, rows_with, signed, table_of
 
 
-# Subjects up to which all flips of signs are tried, 4096 at most. More: time. Fewer: p-values
-# scatter where they could be exact.
+# Up to this number of subjects, all sign flips are tried (4096 at most). More: time. Fewer:
+# p-values scatter although they could be exact.
 _ALL = 12
-# Subjects beyond which values count as skewed without a test. More: time. Fewer: wider bands of
-# values that are not skewed, by 2 % at 30 subjects and 18 % at 12.
+# With more subjects than this, values count as skewed without a test. More: time. Fewer: wider
+# bands for values that are not skewed (by 2 % with 30 subjects, 18 % with 12).
 _MANY = 30
 # Levels of the test for skewed values, for means and for groups. Larger: wider bands where normal
 # values seem skewed by chance. Smaller: bands of skewed values of few subjects are too narrow.
 _SKEWED_MEAN = 0.2
 _SKEWED_GROUPS = 0.05
-# Rotations in the test for skewed values. Fewer: its level is coarse. More: time.
+# Random rotations in the test for skewed values. Fewer: its p-values are coarse. More: time.
 _ROTATIONS = 200
 
 Maps = Inexact[np.ndarray, "n V"]
 Weights = Float[np.ndarray, "P n"]
-"""A draw in each row: a weight for each subject."""
+"""One row for each draw, with a weight for each subject."""
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -104,10 +105,8 @@ class MapResult(Showable):
                 values = x[place]
                 spans.append(f"{name} {values.min():.3g} to {values.max():.3g}")
         where = ", ".join(spans) or "none"
-        largest_value = np.abs(self.values).max()
-        largest = f"{largest_value:.4g} {self.unit}".rstrip()
-        median = np.median(self.reach)
-        half_width = f"{median:.3g} {self.unit}".rstrip()
+        largest = number(np.abs(self.values).max(), 4, self.unit)
+        half_width = number(np.median(self.reach), 3, self.unit)
         return (
             f"MapResult({' x '.join(self.axes)}: largest {largest}\n"
             f"  median half-width of the 95 % band {half_width}\n"
@@ -287,7 +286,7 @@ def _of_groups(
     if _are_skewed(deviations, _SKEWED_GROUPS, rng):
         kind = "subjects within groups (values are skewed, or subjects many)"
         return _resampled(deviations, draws, rng), f"{draws} random draws of {kind}"
-    # The common mean, by the precision of both at each point.
+    # The common mean of both groups, weighted by their precision at each point.
     precisions = []
     for y, deviation in zip(flat, deviations, strict=True):
         squares = np.sum(np.abs(deviation) ** 2, axis=0)
@@ -337,8 +336,8 @@ def _amount(subjects: int) -> str:
 
 
 def flips(n: int, draws: int, rng: np.random.Generator) -> Weights:
-    """Return weights +1 and -1 of n subjects, those of no flip among them: of up to 12 subjects all
-    (those of all signs alike give the same)."""
+    """Return weights +1 and -1 of n subjects, including those without a flip. For up to 12
+    subjects, these are all flips. (Of two opposite flips only one is needed.)"""
     if n > _ALL:
         signs = rng.choice([-1.0, 1.0], (draws, n))
         signs[0] = 1.0
@@ -348,8 +347,9 @@ def flips(n: int, draws: int, rng: np.random.Generator) -> Weights:
 
 
 def _rotations(n: int, draws: int, rng: np.random.Generator) -> Weights:
-    """Return weights by which rotated values have their mean: a random direction for each draw, no
-    rotation in the first. (A rotation keeps the sum of squares.)"""
+    """Return weights with which the mean of the values is the mean of rotated values: a random
+    direction for each draw; the first draw has no rotation. (A rotation keeps the sum of
+    squares.)"""
     direction = rng.normal(size=(draws, n))
     direction[0] = 1.0
     length = np.linalg.norm(direction, axis=1, keepdims=True)
@@ -357,8 +357,8 @@ def _rotations(n: int, draws: int, rng: np.random.Generator) -> Weights:
 
 
 def _are_skewed(parts: list[Maps], level: float, rng: np.random.Generator) -> bool:
-    """Return whether the third moments of deviations from means, summed over the grid, exceed those
-    of their rotations, which have none; or whether there are too many subjects to ask."""
+    """Return whether values are skewed: the third moments of deviations from means, summed over the
+    grid, exceed those of rotated deviations. With too many subjects for this test, return True."""
     if max(map(len, parts)) > _MANY:
         return True
     found = 0.0
@@ -386,18 +386,19 @@ def _skewness(deviation: Float[np.ndarray, "... n V"]) -> Float[np.ndarray, "...
 
 
 def _least(y: Maps) -> Float[np.ndarray, " V"]:
-    """Return the least variance: a map that is zero in all subjects has no statistic."""
+    """Return the least variance that is used as a divisor, for points at which all subjects are
+    zero."""
     square = np.mean(np.abs(y) ** 2, axis=0)
     return 1e-24 * np.maximum(square, 1e-290)
 
 
 def moments(parts: list[Maps], weights: list[Weights], drawn: bool = False):
-    """Return the mean of one part, or the difference of the means of two, with standard error and t
-    for each draw (P, V). Of two parts t is Welch's; of complex maps |t|, the root of the F ratio of
-    a complex mean.
+    """Return the mean of one part, or the difference between the means of two parts; with standard
+    errors and t for each draw (P, V). For two parts, t is Welch's. For complex maps, |t| is the
+    square root of the F ratio of a complex mean.
 
-    **Arguments:** `weights`: of the subjects in the mean; they keep the sum of squares, unless
-    subjects were `drawn`, each as often as its weight.
+    **Arguments:** `weights`: weights of the subjects in the mean. `drawn`: whether weights are
+    numbers of times that subjects were drawn; otherwise weights keep the sum of squares.
     """
     value = 0.0
     variance = 0.0

@@ -1,8 +1,10 @@
-"""`Population`: estimates of several subjects, with their errors, and what they say together.
+"""`Population`: estimates of several subjects with their errors; means, differences and predictions
+over subjects.
 
 A mean or a difference takes three stages: trials of a subject are merged (`_trials`, `_merged`),
 the means are fitted (`reml.py`), and contrasts of them become rows of a table (`_effects`). Checks
-of the subjects' table are in `tables.py`.
+of the subjects' table are in `tables.py`. A wrong mean or error has its cause in `reml.py`; a wrong
+number of subjects, in `_merged`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,8 +30,9 @@ from .tables import Columns, cells_of, factors_of, require, rows_with, signed, t
 
 Numeric = Mapping[str, Annotated[Numbers, Reals("rows", missing=True)]]
 _SLOPE = "slope of "
-# Fewest subjects whose distribution is tested, and the level. Fewer subjects: the test sees
-# nothing. Larger level: normal subjects are doubted. Smaller: outliers pass.
+# Least number of subjects whose distribution is tested, and level of the test. Fewer subjects: the
+# test has no power. Larger level: normally distributed subjects get a finding. Smaller: outliers
+# pass.
 _FEWEST_TESTED = 5
 _NORMAL = 0.02
 Freedom = Annotated[Numbers, Reals("rows", infinite=True, sign="positive")]
@@ -54,9 +57,9 @@ class Population(Showable):
     - `values`, `errors`: mappings from the name of a quantity to its estimates, and to their
       standard errors: one for each row, NaN where it is missing.
     - `units`: mapping from the name of a quantity to its unit. Default: none.
-    - `dof`: degrees of freedom of the errors, one number for each row. Where they are few, errors
-      are drawn towards those of the other subjects (Smyth 2004); if there is a column `strides`,
-      towards their trend over the strides. Default: infinite.
+    - `dof`: degrees of freedom of the errors, one number for each row. If they are few, errors are
+      shrunken towards those of the other subjects (Smyth 2004); with a column `strides`, towards
+      their trend over the strides. Default: infinite.
 
     **Raises:** `DefinitionError` for a table without subjects, columns of different lengths, a
     subject in two groups, errors that are not positive, and if pandas is not installed.
@@ -228,10 +231,10 @@ class Population(Showable):
     ) -> Any:
         """Return the mean difference a - b of two conditions or two groups, and test it.
 
-        Differences are paired in subjects that have both; subjects with one of them count, too.
-        The variances between subjects may differ in each group and condition. Covariance and
-        degrees of freedom are those of Kenward and Roger (1997). If the table also has the other
-        factor, the difference is averaged over it.
+        Differences are paired in subjects that have both; subjects that have only one of the two
+        count, too. The variances between subjects may differ in each group and condition.
+        Covariance and degrees of freedom are those of Kenward and Roger (1997). If the table also
+        has the other factor, the difference is averaged over it.
 
         **Arguments:** `covariates`: columns with common slopes. Default: none.
 
@@ -473,8 +476,10 @@ class Population(Showable):
         return cells.items()
 
     def _contrast(self, quantity: str, a: str, b: str, covariates: Sequence[str] = ()):
-        """Return the estimates in two conditions or groups, the numbers and the weights of their
-        cells, and the differences of subjects that have all."""
+        """Prepare the difference a - b of two conditions or groups. Returns a frame with the
+        estimates of subjects; for each of its rows, the number of its cell (group and condition);
+        the weight of each cell in the difference; and the differences of those subjects that have
+        estimates in all cells."""
         factor, rows = rows_with(self.table, a, b)
         data = self._merged(quantity, covariates, rows)
         require(dict(list(data.groupby("cell")["subject"])), 2)
@@ -525,8 +530,8 @@ def _decay(modulus: float, variance: float) -> tuple[float, float]:
     """Return the rate at which a deviation decays per stride, and its variance; NaN for a modulus
     of zero.
 
-    (A half-life is no quantity to take means of: its error grows with it, so that weights by errors
-    favor the short ones, and it has no value where nothing decays.)
+    (Means of half-lives would be biased: their errors grow with their values, so that weights by
+    errors favor short half-lives. And there is no half-life if deviations do not decay.)
     """
     if modulus == 0:
         return np.nan, np.nan
@@ -535,7 +540,7 @@ def _decay(modulus: float, variance: float) -> tuple[float, float]:
 
 def _polar(fit: MultiplierFit | NaturalMultipliers) -> tuple[float, float, list[float]]:
     """Return modulus and angle of the leading multiplier, and their variances. The angle of a real
-    one is NaN."""
+    multiplier is NaN."""
     z = complex(fit.multipliers[0])
     covariance = fit.multiplier_covariances[0]
     # Derivatives of modulus and angle with respect to real and imaginary part.

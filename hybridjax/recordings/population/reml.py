@@ -1,4 +1,5 @@
-r"""Means of estimates whose errors are known: restricted maximum likelihood, small samples.
+r"""Means over subjects of estimates with known errors: restricted maximum likelihood, for small
+samples.
 
 The estimate of subject s in cell c (its group and condition) is
 
@@ -7,6 +8,10 @@ N(0, v_{sc})$$
 
 with known $v_{sc}$ (meta-analysis: Hardy and Thompson 1996; Jackson, Riley and White 2011). Mixed
 models of other libraries estimate one variance of all errors instead.
+
+`population.py` calls `mixed` (several groups or conditions) or `meta` (one estimate for each
+subject), and gets a `Mixed`, whose `contrast` gives differences. `moderated` first reduces the
+scatter of variances from few blocks.
 """
 
 from typing import Any, NamedTuple
@@ -20,8 +25,8 @@ Reals = Float[np.ndarray, " N"]
 Design = Float[np.ndarray, "N p"]
 Labels = Int[np.ndarray, " N"]
 
-# Degrees of freedom that count as infinite. More: roots of digamma functions overflow. Fewer: exact
-# variances are moderated.
+# From this number on, degrees of freedom count as infinite. More: roots of digamma functions
+# overflow. Fewer: exact variances are moderated.
 _EXACT = 1e9
 
 
@@ -30,7 +35,7 @@ class Mixed(NamedTuple):
 
     coefficients: Float[np.ndarray, " p"]
     covariance: Float[np.ndarray, "p p"]
-    """For small samples."""
+    """Covariance of the coefficients, corrected for small samples."""
     between: Float[np.ndarray, "q q"]
     """Psi, the covariance between subjects."""
     plain: Float[np.ndarray, "p p"]
@@ -40,11 +45,12 @@ class Mixed(NamedTuple):
     uncertainty: Float[np.ndarray, "k k"]
     """Covariance of the elements of Psi."""
     most: int
-    """Degrees of freedom of a t test: subjects beyond the number of coefficients."""
+    """Degrees of freedom of a t test: number of subjects less number of coefficients."""
 
     def contrast(self, w: Float[np.ndarray, " p"]) -> tuple[float, float, float]:
-        """Return value, standard error and degrees of freedom of a contrast (of a single one, those
-        of Kenward and Roger are Satterthwaite's), at most those of a t test."""
+        """Return value, standard error and degrees of freedom of a contrast. (For a single
+        contrast, Kenward and Roger's degrees of freedom are Satterthwaite's.) They are at most
+        those of a t test."""
         value = float(w @ self.coefficients)
         error = float(np.sqrt(w @ self.covariance @ w))
         slope = np.einsum("i,kij,j->k", w, self.slopes, w)
@@ -65,7 +71,8 @@ def mixed(
 
     Psi is free between cells that some subject shares, and zero between others (Welch's case).
     """
-    # Whether two estimates are of one subject, (N, N), and which cell each is in, (N, q).
+    # Matrices: whether two estimates belong to one subject, (N, N); and to which cell each estimate
+    # belongs, (N, q).
     same = subjects[:, None] == subjects
     cell = np.eye(cells.max() + 1)[cells]
     # The elements of a lower triangular factor of Psi that are not zero.
@@ -78,8 +85,9 @@ def mixed(
     v = v / square
 
     def squares(free):
-        """Return a factor of Psi and, for generalized least squares, the covariance of the
-        estimates, that of the coefficients, their weights, and the projection to residuals."""
+        """Return a factor of Psi; and for generalized least squares, the covariance of the
+        estimates, the covariance of the coefficients, the weights of the estimates, and the
+        projection to residuals."""
         lower = np.zeros((cell.shape[1], cell.shape[1]))
         lower[row, column] = free
         between = cell @ lower @ lower.T @ cell.T
@@ -143,8 +151,9 @@ def mixed(
 
 def meta(y: Reals, v: Reals, x: Design) -> Mixed:
     """Return the fit of single estimates of subjects, with the covariance of Hartung and Knapp
-    (2001; Knapp and Hartung 2003), scaled by the weighted residuals, but not below one: estimates
-    that scatter less than their errors would have none."""
+    (2001; Knapp and Hartung 2003), scaled by the weighted residuals. The factor is at least one:
+    otherwise estimates that happen to scatter less than their errors would have errors that are too
+    small."""
     each = np.arange(len(y))
     fit = mixed(y, v, x, each, np.zeros(len(y), int))
     variance = v + fit.between[0, 0]
@@ -182,9 +191,9 @@ def spread_interval(y: Reals, v: Reals, x: Design) -> tuple[float, float]:
 
 
 def moderated(v: Reals, dof: Reals, trend: Design) -> Reals:
-    """Return variances with less scatter: means of each, weighted by its degrees of freedom, and of
-    the common trend of their logarithms, weighted by the freedom that fits their scatter (empirical
-    Bayes: Smyth 2004).
+    """Return variances with less scatter (empirical Bayes: Smyth 2004). Each is a weighted mean of
+    the variance itself and of the common trend of all variances. The weight of the former is its
+    degrees of freedom; the weight of the latter follows from the scatter of the variances.
 
     Variances that are estimated from few blocks would otherwise give the largest weights to
     subjects whose errors happen to be underestimated.
@@ -198,7 +207,8 @@ def moderated(v: Reals, dof: Reals, trend: Design) -> Reals:
     mean = trend @ np.linalg.lstsq(trend, log)[0]
     scatter = np.sum((log - mean) ** 2) / surplus
     excess = scatter - special.polygamma(1, half).mean()
-    # The half of the prior freedom, at which a log chi-squared has the variance of the excess.
+    # Half of the prior degrees of freedom, with which a log chi-squared variable has the excess
+    # variance.
     prior = _EXACT
     if excess > 1 / _EXACT:
         prior = _root(lambda half: special.polygamma(1, half) - excess, 1e-3, _EXACT)

@@ -1,4 +1,8 @@
-"""Tables of a study, as data frames: who was recorded, and results."""
+"""Tables of a study as data frames: the subjects with their groups and conditions.
+
+`Population` and `PopulationMaps` call `table_of` to check a table, `cells_of` and `rows_with` to
+select rows, and `signed` for the sentences of a methods section.
+"""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol, runtime_checkable
@@ -61,7 +65,8 @@ def cells_of(table: Any) -> Any:
 
 
 def rows_with(table: Any, *labels: str) -> tuple[str, Any]:
-    """Return the factor to which different labels belong, and whether a row has one of them.
+    """Return the factor (group or condition) to which the labels belong, and for each row whether
+    it has one of the labels.
 
     **Raises:** `DefinitionError` if no factor has all of them.
     """

@@ -1,4 +1,7 @@
-"""Attributes that classes do not have, in the words of other libraries."""
+"""Attribute names of other libraries that a class here does not have, each with what to use.
+
+Tables for `leads.py`.
+"""
 
 from .sentences import COMPARE, CONTROL, DECAY, EXPONENT
 
@@ -373,4 +376,4 @@ ATTRIBUTES = {
         ),
     },
 }
-"""What to do instead of an attribute that a class, or one derived from it, has not."""
+"""What to do instead of an attribute that is missing in a class and in those derived from it."""

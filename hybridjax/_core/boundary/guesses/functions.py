@@ -1,4 +1,7 @@
-"""Names that namespaces do not have, in the words of other libraries."""
+"""Function names of other libraries that a namespace here does not have, each with the name to use.
+
+Tables for `leads.py`.
+"""
 
 from .sentences import (
     AT_TIMES,

@@ -1,4 +1,8 @@
-"""Arguments that functions do not have, in the words of other libraries, and those they need."""
+"""Argument names of other libraries that a function here does not have, each with the name to use;
+and what an argument is that a call left out.
+
+Tables for `leads.py`.
+"""
 
 from .sentences import AT_TIMES, CONTROL, HELD_OUT
 

@@ -1,4 +1,8 @@
-"""Objects that functions need, and those of other steps that they are given instead."""
+"""What to do when a function is given the wrong object: the call that makes the one it needs, and
+the step that leads there from the one it was given.
+
+Tables for `leads.py`.
+"""
 
 MAKERS = {
     "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of these are "

@@ -1,4 +1,4 @@
-"""Sentences that stand in several tables, and libraries whose names lead to them."""
+"""Sentences that several tables of this folder use, and libraries whose names lead to one."""
 
 CONTROL = (
     "`hj.convert.to_control(model)` is a system of python-control, for its functions"
