@@ -238,7 +238,7 @@ def _moduli(
     """Return the moduli of draws. Where the estimates are a complex pair, both have the root of the
     product: draws may be two real numbers, one larger and one smaller than the modulus."""
     moduli = np.abs(draws)
-    for k in np.flatnonzero(values.imag > 0):
+    for k in np.flatnonzero(values.imag > 0).tolist():
         twin = _twin(values, k)
         square = moduli[:, k] * moduli[:, twin]
         common = np.sqrt(square)
