@@ -100,9 +100,10 @@ def plain_curve(recording, phase, name):
     mean = np.stack([intervals.sums(x) for x in both.T], axis=1) / count[:, None]
     both -= mean[intervals.trial] * fit.used[:, None]
     across, deviation = both[:, :-1], both[:, -1]
-    a = np.linalg.lstsq(across.T @ across + np.diag(fit.penalty), across.T @ deviation)[
-        0
-    ]
+    # The penalty of the fit stands beside whitened errors, whose variance is `noise`.
+    variance = fit.missed[fit.used].var() * fit.smoothness.excess
+    penalty = fit.penalty * variance / fit.smoothness.noise
+    a = np.linalg.lstsq(across.T @ across + np.diag(penalty), across.T @ deviation)[0]
     return basis(np.arange(200) / 200, WAVES) @ a
 
 

@@ -96,9 +96,18 @@ def _(thing: HTF) -> Any:
 
 @_columns.register
 def _(thing: MultiplierFit) -> Any:
-    real, imaginary = np.sqrt(
-        np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)
-    ).T
+    return _with_errors(thing)
+
+
+@_columns.register
+def _(thing: NaturalMultipliers) -> Any:
+    return _with_errors(thing)
+
+
+def _with_errors(thing: MultiplierFit | NaturalMultipliers) -> Any:
+    """Return multipliers, their standard errors, and intervals of their moduli."""
+    covariances = np.diagonal(thing.multiplier_covariances, axis1=1, axis2=2)
+    real, imaginary = np.sqrt(covariances).T
     low, high = thing.interval().T
     return {
         **_parts("", thing.multipliers),
@@ -108,14 +117,6 @@ def _(thing: MultiplierFit) -> Any:
         "modulus_low": low,
         "modulus_high": high,
     }
-
-
-@_columns.register
-def _(thing: NaturalMultipliers) -> Any:
-    low, high = thing.interval().T
-    errors = {"standard_error": thing.standard_errors}
-    bounds = {"modulus_low": low, "modulus_high": high}
-    return {**_parts("", thing.multipliers), **errors, **bounds}
 
 
 @_columns.register

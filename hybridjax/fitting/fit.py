@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from .._core.arguments import searching
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Seed
+from .._core.findings import warn_of
 from .._core.memo import Recent
 from .._core.progress import counted, working
 from .._core.results import Result
@@ -124,8 +125,25 @@ def fit_model(
     """
     transient = _transients(system, data, free)
     if transient is not None:
-        return _fit_transients(transient, guesses, seed)
-    problem, near = _prepare(system, data, free, guess)
+        fit = _fit_transients(transient, guesses, seed)
+    else:
+        problem, near = _prepare(system, data, free, guess)
+        fit = _fit_cycles(problem, system, near, guesses, seed)
+    warn_of([x for x in fit.findings if x.cause == "misfit"], wrappers=2)
+    return fit
+
+
+def _fit_cycles(
+    problem: FitProblem,
+    system: HybridSystem,
+    near: LimitCycle,
+    guesses: int,
+    seed: int,
+) -> ModelFit:
+    """Fit parameters to data of limit cycles, which are searched for near one.
+
+    **Raises:** `ComputationError` if no guess has a limit cycle on which the data can be observed.
+    """
     parameters = problem.parameters
     x0 = np.asarray(parameters.encode(parameters.read(system, problem.observations)))
     starts = _starts_around(x0, guesses, seed)

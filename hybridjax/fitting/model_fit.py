@@ -30,7 +30,7 @@ from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
 from ..sections.linearization import linearize
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
-from .problem import DELAYS, FitProblem, of_system
+from .problem import DELAYS, FitProblem, of_system, tail_of
 
 
 # Singular values of the sensitivities below this, or below this part of the largest one, are zero.
@@ -41,6 +41,15 @@ _RANK = 1e-9
 # whose smallest singular value exceeds this. Larger: wrong exponents are printed as integers.
 # Smaller: rounding errors of derivatives are printed.
 _CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
+
+# Probability that the residuals of a right model are called a misfit (up to five times that, where
+# variances were estimated from few realizations). Larger: right models are doubted. Smaller: wrong
+# models whose parameters are a few standard errors off pass.
+FALSE_ALARMS = 1e-3
+# Residuals of this part of what the best identified combination would change are errors of
+# integration. Larger: misfits to precise data pass. Smaller: data without noise are a misfit if
+# their standard deviations are tiny.
+_INTEGRATED = 1e-7
 
 
 class Identifiability(Showable, eqx.Module):
@@ -413,8 +422,10 @@ class ModelFit(ParameterFit):
     - `guesses`: for each guess, in order, its `values` (p,), the `fitted` ones (p,), their `cost`,
         the number of evaluations, `steps`, and the `result`. `result`: code of the best one.
     - `problem`: the minimized function.
-    - `findings`: "not identified", for combinations of parameters; "a bound", for parameters that
-        reach theirs within their standard errors; "no convergence".
+    - `findings`: "misfit" if residuals are larger than the standard deviations of the data explain,
+        by a chi-square test at the level of 0.1 %; "not identified", for combinations of
+        parameters; "a bound", for parameters that reach theirs within their standard errors; "no
+        convergence".
     """
 
     system: HybridSystem
@@ -547,8 +558,9 @@ class ModelFit(ParameterFit):
         return "\n  ".join(lines)
 
     def _doubts(self) -> Iterator[Finding]:
-        """Yield what is not identified, and bounds that standard errors reach."""
+        """Yield a misfit, what is not identified, and bounds that standard errors reach."""
         yield from not_converged(self.result)
+        yield from self._misfit()
         for combination in self.identifiability.descriptions():
             yield Finding("not identified", f"{combination}.")
         errors = np.where(np.isfinite(self.standard_errors), self.standard_errors, 0.0)
@@ -559,6 +571,25 @@ class ModelFit(ParameterFit):
                     f"{self.names[k]} reaches its bound {bounds[k]:g} within its error."
                 )
                 yield Finding("a bound", text)
+
+    def _misfit(self) -> Iterator[Finding]:
+        """Yield a finding if the standard deviations of the data do not explain the residuals."""
+        strongest = self.identifiability.singular_values[0]
+        are_exact = np.sqrt(self.cost) <= _INTEGRATED * strongest
+        if not self.weighted or not self.dof or are_exact:
+            return
+        most = self.problem.most
+        p = float(tail_of(np.asarray(self.cost), self.dof, most))
+        if p >= FALSE_ALARMS:
+            return
+        times = np.sqrt(self.chi2_per_dof / most)
+        yield Finding(
+            "misfit",
+            f"residuals are {times:.2g} times as large as the standard deviations of the data "
+            f"explain ({p_value(p)}), so that the standard errors do not hold: fit other "
+            "parameters or another model, try more `guesses` (this minimum may be a local one), "
+            "or give larger standard deviations if those of the data are too small.",
+        )
 
     def _cost(self) -> str:
         size = (

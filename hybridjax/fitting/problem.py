@@ -235,6 +235,25 @@ def candidate_cycle(
     return cycle, last
 
 
+def tail_of(
+    cost: Float[np.ndarray, "*n"], dof: float, most: float
+) -> Float[np.ndarray, "*n"]:
+    """Return the probability that a right model has a cost as large.
+
+    The squares of errors in units of estimated variances have Fisher's distribution. Their sum is
+    taken as chi-squared with the same mean and variance (Satterthwaite 1946).
+
+    **Arguments:** `most`: largest mean square that estimated variances explain; 1 for known ones.
+    """
+    from scipy import special  # (a fifth of a second)
+
+    level, deviation = estimated_noise(most, most)
+    if not np.isfinite(deviation):
+        return np.ones_like(cost)
+    times_fewer = deviation**2
+    return special.chdtrc(dof / times_fewer, cost / level / times_fewer)
+
+
 class FitProblem(eqx.Module):
     """Weighted residuals as a function of the coordinates x of the free parameters."""
 
@@ -253,11 +272,14 @@ class FitProblem(eqx.Module):
         misfit = cost / max(dof, 1)
         if not self.weighted:
             return max(misfit, np.finfo(float).tiny) if dof else np.nan
+        _, deviation = estimated_noise(self.most, misfit)
+        return deviation**2
+
+    @property
+    def most(self) -> float:
+        """Largest mean square of the residuals that estimated variances explain."""
         htfs = [x for x in self.observations if isinstance(x, ObservedHTF)]
-        return (
-            estimated_noise(max((float(x.most) for x in htfs), default=1.0), misfit)[1]
-            ** 2
-        )
+        return max((float(x.most) for x in htfs), default=1.0)
 
     def evaluated(
         self, x: Float[Array | np.ndarray, " p"], guess: LimitCycle | None

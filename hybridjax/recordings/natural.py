@@ -30,6 +30,7 @@ from .._core.boundary.values import Whole
 from .._core.findings import Finding, print_findings
 from .._core.progress import working
 from .._core.showable import WithMultipliers
+from .._core.text import columns, rounded, standard_error
 from ..errors import DefinitionError
 from ..identify.denominator import coefficients_of
 from ..identify.multiplier_estimate import (
@@ -105,14 +106,7 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
     def multiplier_covariances(self) -> Float[np.ndarray, "d 2 2"]:
         """Covariance of (Re, Im) of each multiplier over the resamplings. The imaginary part of a
         real multiplier has no variance."""
-        covariances = np.zeros((len(self.multipliers), 2, 2))
-        for k, z in enumerate(self.multipliers):
-            drawn = self.draws[:, k]
-            if z.imag:
-                covariances[k] = np.cov(drawn.real, drawn.imag)
-            else:
-                covariances[k, 0, 0] = drawn.real.var()
-        return covariances
+        return _covariances(self.multipliers, self.draws)
 
     @property
     def coefficients(self) -> Float[np.ndarray, " d"]:
@@ -207,14 +201,43 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         return np.stack([low, ends.max(axis=1)], axis=1)
 
     def __repr__(self) -> str:
-        lines = [
-            f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
-            f"{self.block} cycles)",
-            *_printed("by instruments", self.multipliers, self.interval()),
-            *_printed("least squares", self.plain, self.interval(plain=True)),
-            print_findings(self.findings, "  "),
+        rows = [
+            *_rows_of("by instruments", self.multipliers, self.draws, self.interval()),
+            *_rows_of(
+                "least squares",
+                self.plain,
+                self.plain_draws,
+                self.interval(plain=True),
+            ),
         ]
-        return "\n".join(lines).rstrip()
+        head = (
+            f"NaturalMultipliers({self.cycles} cycles, order {len(self.multipliers)}, blocks of "
+            f"{self.block} cycles)"
+        )
+        findings = print_findings(self.findings, "  ")
+        return f"{head}{columns(rows)}\n{findings}".rstrip()
+
+
+def _covariances(
+    values: Complex[np.ndarray, " d"], draws: Draws
+) -> Float[np.ndarray, "d 2 2"]:
+    """Return the covariance of (Re, Im) of each multiplier over draws. A real multiplier has no
+    imaginary part; those of a pair mirror each other."""
+    covariances = np.zeros((len(values), 2, 2))
+    for k, z in enumerate(values):
+        drawn = draws[:, k]
+        if z.imag:
+            mirrored = draws[:, _twin(values, k)].conj()
+            both = np.concatenate([drawn, mirrored])
+            covariances[k] = np.cov(both.real, both.imag)
+        else:
+            covariances[k, 0, 0] = drawn.real.var()
+    return covariances
+
+
+def _twin(values: Complex[np.ndarray, " d"], k: int) -> int:
+    """Return the place of the other one of a pair."""
+    return int(np.argmin(np.abs(values - values[k].conj())))
 
 
 def _moduli(
@@ -224,9 +247,8 @@ def _moduli(
     the product of the two draws, since these may be two real numbers, one larger and one smaller
     than the modulus."""
     moduli = np.abs(draws)
-    for k in np.flatnonzero(values.imag > 0):
-        distance = np.abs(values - values[k].conj())
-        twin = int(np.argmin(distance))
+    for k in np.flatnonzero(values.imag > 0).tolist():
+        twin = _twin(values, k)
         square = moduli[:, k] * moduli[:, twin]
         common = np.sqrt(square)
         moduli[:, [k, twin]] = common[:, None]
@@ -247,16 +269,20 @@ def _beside(values: Complex[np.ndarray, " d"], draws: Draws) -> Draws:
     return ordered
 
 
-def _printed(name: str, multipliers: Draws, bounds: np.ndarray) -> Iterator[str]:
-    for z, (low, high) in zip(multipliers, bounds, strict=True):
-        if z.imag < 0:
-            continue
-        value = f"{z.real:.3f}"
-        if z.imag > 0:
-            value += f"±{z.imag:.3f}j"
-        yield (
-            f"  {name:15s} {value:>15s}   modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
-        )
+def _rows_of(
+    name: str,
+    multipliers: Complex[np.ndarray, " d"],
+    draws: Draws,
+    bounds: Float[np.ndarray, "d 2"],
+) -> Iterator[tuple[str, ...]]:
+    """Yield rows of multipliers with their standard errors, and the modulus of a pair once."""
+    variances = np.linalg.trace(_covariances(multipliers, draws))
+    for z, error, (low, high) in zip(
+        multipliers, np.sqrt(variances), bounds, strict=True
+    ):
+        value = f"{rounded(z, error)} ± {standard_error(error)}"
+        modulus = f"modulus {abs(z):.3f}, 95 %: {low:.3f} to {high:.3f}"
+        yield name, value, modulus if z.imag >= 0 else ""
 
 
 @checked

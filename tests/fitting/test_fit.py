@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.fitting import problem
+from hybridjax.fitting import model_fit, problem
 
 from ..conftest import OUTPUTS, no_compilation
 from .conftest import HOPPER, SECTIONS, Oscillator
@@ -76,6 +76,64 @@ def test_errors_that_no_residual_shows_are_unknown():
             [speed, hj.fitting.ObservedCycle(impact, period=1, period_std=1)],
             "A",
         )
+
+
+def juggled(noise=0.0, std=1e-3, **change):
+    """Heights and speeds of a juggled ball at five phases, with drawn errors."""
+    cycle = hj.find_limit_cycle(hj.models.PaddleJuggler(**change))
+    where = hj.ClockPhase(5, anchor=hj.Crossing("v", "falling"))
+    exact = hj.fitting.ObservedCycle.of(cycle, where, ("y", "v"))
+    values = np.asarray(exact.measured[0])
+    drawn = noise * np.random.default_rng(0).normal(size=values.shape)
+    return hj.fitting.ObservedCycle(where, ("y", "v"), values + drawn, std=std)
+
+
+def causes(fit):
+    return [finding.cause for finding in fit.findings]
+
+
+def test_a_model_that_does_not_fit_says_that_its_errors_do_not_hold():
+    """Another gravity changes speeds, which no amplitude of the paddle does."""
+    data = juggled(noise=1e-3)
+    wrong = hj.models.PaddleJuggler(g=9.7)
+    with pytest.warns(hj.errors.FindingWarning, match="Misfit: residuals are"):
+        fit = hj.fit_model(wrong, data, "A")
+    assert fit.chi2_per_dof > 5
+    (found,) = fit.findings
+    assert found.cause == "misfit"
+    assert "standard errors do not hold" in found.text
+    assert "`guesses`" in found.text
+    size = np.sqrt(fit.chi2_per_dof)
+    assert f"{size:.2g} times" in found.text
+    assert str(found).splitlines()[0] in repr(fit)
+    assert "standard errors do not hold" in fit._repr_html_()
+    assert causes(fit.estimate) == ["misfit"]
+    assert "Misfit" in repr(fit.estimate)
+    assert causes(hj.fit_model(wrong, data, ("A", "g"))) == []
+
+
+def test_data_without_noise_are_no_misfit_whatever_their_errors_are_said_to_be():
+    for std in (1e-3, 1e-10):
+        fit = hj.fit_model(hj.models.PaddleJuggler(A=0.17), juggled(std=std), "A")
+        assert causes(fit) == []
+
+
+def test_a_right_model_is_called_a_misfit_in_one_of_a_thousand_draws():
+    """Of variances that are known, and of those that are estimated from a few realizations."""
+    rng = np.random.default_rng(0)
+    draws = 20_000
+    lines = 30
+    for realizations in (np.inf, 4, 9):
+        errors = rng.normal(size=(draws, lines, 2))
+        most = 1.0
+        if np.isfinite(realizations):
+            most = realizations / (realizations - 1)
+            drawn = rng.chisquare(2 * realizations, (draws, lines, 1))
+            errors /= np.sqrt(drawn / (2 * realizations))
+        cost = (errors**2).sum(axis=(1, 2))
+        p = problem.tail_of(cost, 2.0 * lines, most)
+        alarms = np.mean(p < model_fit.FALSE_ALARMS)
+        assert 2e-4 < alarms < (2e-3 if most == 1 else 5e-3)
 
 
 @pytest.mark.slow
