@@ -5,16 +5,16 @@ Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 1
 """
 
 import dataclasses
-from typing import Annotated, Any, Literal, NamedTuple, SupportsIndex, get_args
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, SupportsIndex, get_args
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from .._core.boundary.checked import checked, checked_methods
-from .._core.boundary.kinds import Count, Numbers, Share
-from .._core.boundary.values import Reals
+from .._core.boundary.checked import checked, checked_methods, taken_parameters
+from .._core.boundary.kinds import Count, Share, Vector
 from .._core.html import COLORS, Curve as Line, card, picture, table
 from .._core.memo import remembered
 from .._core.precision import require_x64
@@ -23,7 +23,7 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import Guess, copies_of, require_positive
+from ..systems.system import Guess, copies_of, parameters_of, require_positive
 from .batches import front
 from .branch_ends import explained
 from .coincidence import SAME
@@ -182,11 +182,12 @@ class Branch(Showable, eqx.Module):
 @working("continuation")
 def continuation(
     cycle: LimitCycle,
-    parameter: str,
-    range: Annotated[Numbers, Reals("n")],
+    parameter: str | None = None,
+    range: Vector | None = None,
     *,
     step: Share = 0.05,
     max_points: Count = 1000,
+    **parameters: Vector,
 ) -> Branch:
     """Continue a limit cycle in a parameter, and mark changes of its stability.
 
@@ -201,7 +202,8 @@ def continuation(
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
     - `range`: two or more numbers, ascending or descending. The branch ends at the first and the
-        last. It contains a cycle at each of the numbers, and further cycles in between.
+        last. It contains a cycle at each of the numbers, and further cycles in between. Without
+        dots in the name, `k=(8, 12)` stands for the name and the range.
     - `step`: the longest step, as a fraction of the range and of the magnitudes of the
         states. Default: 0.05.
     - `max_points`: largest number of cycles in each direction. Default: 1000.
@@ -216,12 +218,13 @@ def continuation(
     **Example:**
 
     ```python
-    branch = hj.continuation(cycle, "k", (10.0, 11.0), step=0.5)
+    branch = hj.continuation(cycle, k=(10.0, 11.0), step=0.5)
     print(branch.values, branch.stable)
     ```
 
     **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `branch.to_pandas()`.
     """
+    parameter, range = _parameter_and_range(cycle, parameter, range, parameters)
     values = _check(cycle, range)
     cycle = _at_event(cycle)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
@@ -249,6 +252,34 @@ def continuation(
     ahead, end = trace.run(first.oriented(sense))
     points = [*back[:0:-1], *ahead]
     return _branch(curve, points, len(back) - 1, (begin, end))
+
+
+def _parameter_and_range(
+    cycle: LimitCycle,
+    parameter: str | None,
+    range: Any,
+    by_name: Mapping[str, Any],
+) -> tuple[str, Any]:
+    """Return the name of the parameter, and its range.
+
+    **Raises:** `DefinitionError` where one of them is missing, or there are several.
+    """
+    given = list(taken_parameters(continuation, cycle, by_name).items())
+    if parameter is not None and range is not None:
+        given.append((parameter, range))
+    if len(given) > 1:
+        names = " and ".join(f"`{name}`" for name, _ in given)
+        raise DefinitionError(
+            f"a continuation has one parameter, not {names}: `hj.sweep` takes several."
+        )
+    if not given or (parameter is not None and range is None):
+        names = parameters_of(cycle.system)
+        name = parameter or next((x for x in names if "." not in x), "k")
+        raise DefinitionError(
+            "continuation needs a parameter and its `range`, with the value of the cycle's "
+            f"system between them, as in `hj.continuation(cycle, '{name}', (0.1, 0.5))`."
+        )
+    return given[0]
 
 
 def _at_event(cycle: LimitCycle) -> LimitCycle:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -134,6 +134,15 @@ class AtEvent(eqx.Module):
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for an event that the system does not have."""
         s.transition_index(self.name)
+
+
+SectionLike: TypeAlias = Crossing | AtEvent | str
+"""A single section; an event also by its name."""
+
+
+def as_section(section: SectionLike) -> Crossing | AtEvent:
+    """Return a section: of a name, that right after the event."""
+    return AtEvent(section) if isinstance(section, str) else section
 
 
 class ListLevels(AbstractLevels):

@@ -21,7 +21,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import Program, quick_jit
-from .._core.executor import Array, is_traced, namespace
+from .._core.executor import Array, is_traced, namespace, to_host
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
@@ -44,12 +44,14 @@ from ..engine.trajectory import (
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system
 from ..systems.quotient import check_symmetry
+from ..systems.start import StateLike, guess_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from ..systems.transition import SAME_TIME
 from . import rivals
 from .coincidence import all_commute, groups_on
 from .crossing import AtEvent, Crossing, to_section
+from .cycle import LimitCycle
 
 
 # Error of a step relative to the sizes of states. Larger: derivatives, which are those of the
@@ -208,7 +210,7 @@ class _Request(eqx.Module):
 @checked
 def flow(
     system: HybridSystem,
-    start: Guess | Flow,
+    start: Guess | Flow | LimitCycle | StateLike,
     until: Scalar | str | AtEvent | Crossing | None = None,
     *,
     events: Count | None = None,
@@ -231,7 +233,9 @@ def flow(
 
     - `system`: a `HybridSystem`.
     - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
-      that ended there. A `Guess` with states (L, n) starts L flows.
+      that ended there. A `Guess` with states (L, n) starts L flows. A state (n,), in order or by
+      name, stands for a `Guess` where only one chart has such states, and a `LimitCycle` for its
+      state at `anchor`.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
     - `within`: the longest duration, required for all ends other than a time. Do not make it much
@@ -282,7 +286,7 @@ def flow(
 
 def requested(
     system: HybridSystem,
-    start: Guess | Flow,
+    start: Guess | Flow | LimitCycle | StateLike,
     until: Any,
     events: int | None,
     within: Any,
@@ -315,6 +319,10 @@ def requested(
         system = current(Driven(system, drive))
     s = Structure(system)
     check_schedules(s)
+    if isinstance(start, LimitCycle):
+        start = _at_anchor(start)
+    elif not isinstance(start, Guess | Flow):
+        start = guess_of(s, start, "`start`")
     if isinstance(start, Flow):
         _require_start(start, s)
         lanes = start.lanes
@@ -353,6 +361,14 @@ def _require_start(start: Flow, s: Structure) -> None:
             f"the flow that ended at `start` failed ({Result(int(start.result)).message}): nothing "
             "can go on from there."
         )
+
+
+def _at_anchor(cycle: LimitCycle) -> Guess:
+    """The state of a limit cycle where it begins."""
+    state = tuple(cycle.state.values())
+    anchor = to_host(cycle.anchor)
+    name = cycle.structure.names[int(anchor.chart[0])]
+    return Guess(name, state, anchor.t[0])
 
 
 def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:

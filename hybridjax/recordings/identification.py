@@ -43,6 +43,7 @@ from .inspection.inspect import check_recording, inspect_cycles
 from .natural import NaturalMultipliers, natural_multipliers
 from .phase import Phase
 from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
+from .read import RecordingLike, as_recording
 from .recording import Recording
 from .sampling import DriftCycles, sample_sections, without_drift
 from .smoothing import Bandwidth
@@ -176,7 +177,7 @@ class NaturalIdentification(WithMultipliers, eqx.Module):
 @checked
 @working("identify_recording")
 def identify_recording(
-    recording: Recording,
+    recording: RecordingLike,
     sections: Phase | PhaseDefinition,
     inputs: OptionalNames = (),
     outputs: OptionalNames = (),
@@ -196,7 +197,8 @@ def identify_recording(
 
     **Arguments:**
 
-    - `recording`: the recording, perturbed by the inputs, if there are any.
+    - `recording`: the recording, perturbed by the inputs, if there are any; or the path of its
+      file, or a table (`hj.Recording.from_frame`).
     - `sections`, `inputs`, `outputs`, `n_sections`, `bandwidth`, `timing`: those of
       `sample_sections`, with the same defaults.
     - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
@@ -236,6 +238,7 @@ def identify_recording(
         )
     _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
+    recording = as_recording(recording)
     inspection = check_recording(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
     say("phase")

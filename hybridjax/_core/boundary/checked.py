@@ -4,7 +4,7 @@ import functools
 import inspect
 import sys
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -115,6 +115,34 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
         ) from None
 
 
+def taken_parameters(
+    function: Callable, thing: Any, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the keywords of a call that are no arguments of a public function, but parameters of a
+    system, or of the system of a limit cycle, in the form of their kind. (Names of other things, as
+    of a function that makes systems, are not checked.)
+
+    **Raises:** `WrongArguments` for a name that is no parameter; `DefinitionError` for a value that
+    does not fit.
+    """
+    kinds: _Kinds = getattr(function, "kinds")  # noqa: B009
+    is_known = leads.parameters_of(thing)
+    called = function.__name__
+    taken = {}
+    for name, value in given.items():
+        if is_known and name not in is_known:
+            visible = [x for x in kinds.by_name if x not in given]
+            raise WrongArguments(leads.about_keyword(called, name, visible, thing))
+        try:
+            taken[name] = kinds.of_parameters.take(value)
+        except Misfit as misfit:
+            lead = leads.about_object(called, kinds.of_parameters, value)
+            raise DefinitionError(
+                f"{called}: `{misfit.of(name).path}` {misfit.problem}{lead}."
+            ) from None
+    return taken
+
+
 def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable:
     kinds = _Kinds(function, cls)
 
@@ -201,6 +229,11 @@ class _Kinds:
                 rest = name
         return named, (rest, self.by_name.get(rest))
 
+    @functools.cached_property
+    def of_parameters(self) -> Kind:
+        """The kind of further keywords, `**parameters`, which `taken_parameters` checks."""
+        return cast(Kind, kind_of(self.hints()["parameters"]))
+
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.
 
@@ -277,7 +310,7 @@ class _Kinds:
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
         called = self.function if self.cls is None else self.cls
-        return leads.about_object(called.__qualname__, kind, value, args)
+        return leads.about_object(called.__qualname__, kind, value, args, name)
 
     @functools.cached_property
     def _names(self) -> "_Names":

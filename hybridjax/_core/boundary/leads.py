@@ -114,7 +114,7 @@ def _about_part(thing: Any, name: str) -> str:
     for other names."""
     if _is_system(thing):
         return ""
-    if name in _parameters(thing):
+    if name in parameters_of(thing):
         return f": `.system.{name}` is a parameter of its system"
     if name not in _signals(thing):
         return ""
@@ -239,7 +239,7 @@ def _in_names_of(given: Sequence[Any], sentence: str) -> str:
     """Return a sentence on a signal 'y' and a parameter 'k' with names of what was given."""
     named = [x for x in given if isinstance(x, str)]
     for thing in given:
-        for letter, names in (("'y'", _signals(thing)), ("'k'", _parameters(thing))):
+        for letter, names in (("'y'", _signals(thing)), ("'k'", parameters_of(thing))):
             if names:
                 meant = [name for name in named if name in names] or names
                 sentence = sentence.replace(letter, f"'{meant[0]}'")
@@ -264,7 +264,7 @@ def _signals(thing: Any) -> list[str]:
         return []
 
 
-def _parameters(thing: Any) -> list[str]:
+def parameters_of(thing: Any) -> list[str]:
     system = getattr(thing, "system", thing)
     if not _is_system(system):
         return []
@@ -303,20 +303,43 @@ def _leads_of_argument(
     own = [function]
     for word in (name, *words.synonyms(name)):
         yield words.lead_of(KEYWORDS, own, word)
-    parameter = _parameter_like(name, _parameters(first))
-    if parameter is not None:
-        about = words.lead_of(KEYWORDS, own, "parameter")
-        yield about and about.replace("'k'", f"'{parameter}'")
-        yield f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
+    yield _about_parameter(own, _parameter_like(name, parameters_of(first)))
     yield _use(_synonym(name, parameters))
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
     yield words.lead_of(KEYWORDS, owners, name)
+    yield _about_parameter(own, _described(first, name))
     yield _use(spelled_alike(name, parameters))
+    yield _about_parameter(own, _described(first, name, alike=True))
     for part in words.parts(name):
         yield _use(words.with_part(part, parameters))
         yield words.lead_of(KEYWORDS, owners, part)
     yield _use(spelled_alike(name, parameters, _ALIKE))
+
+
+def _about_parameter(function: Sequence[str], parameter: str | None) -> str | None:
+    """Return how a function gets a parameter of its system."""
+    if parameter is None:
+        return None
+    about = words.lead_of(KEYWORDS, function, "parameter")
+    if about is not None:
+        return about.replace("'k'", f"'{parameter}'").replace("k=", f"{parameter}=")
+    return (
+        f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
+    )
+
+
+def _described(thing: Any, word: str, alike: bool = False) -> str | None:
+    """Return the parameter of a system in whose description a word stands, or one like it."""
+    system = getattr(thing, "system", thing)
+    if not _is_system(system):
+        return None
+    described: dict[str, str] = {}
+    for field in dataclasses.fields(system):
+        for x in field.metadata.get("doc", "").split():
+            described.setdefault(x, field.name)
+    meant = spelled_alike(word, [x for x in described if len(x) > 4]) if alike else word
+    return described.get(meant or "")
 
 
 def _parameter_like(name: str, parameters: Collection[str]) -> str | None:
@@ -332,15 +355,19 @@ def _synonym(name: str, among: Collection[str]) -> str | None:
 
 
 def about_object(
-    function: str, kind: Kind | None, value: Any, given: Sequence[Any] = ()
+    function: str,
+    kind: Kind | None,
+    value: Any,
+    given: Sequence[Any] = (),
+    argument: str = "",
 ) -> str:
     """Return the call that makes what a function needs instead of a value, or the part of it that
     is needed, as the rest of a sentence; "" if none is known.
 
     **Arguments:** `function`: its name, of a method with its class. `given`: all arguments, whose
-    names the call has.
+    names the call has. `argument`: the name of the argument.
     """
-    return _in_names_of(given, _about_object(function, kind, value))
+    return _in_names_of(given, _about_object(function, kind, value, argument))
 
 
 def about_percent(kind: Kind | None, value: Any) -> str:
@@ -352,8 +379,9 @@ def about_percent(kind: Kind | None, value: Any) -> str:
     return f": {value:g} % is {value / 100:g}" if is_share and 5 <= value <= 100 else ""
 
 
-def _about_object(function: str, kind: Kind | None, value: Any) -> str:
-    for name in (function, function.rpartition(".")[2]):
+def _about_object(function: str, kind: Kind | None, value: Any, argument: str) -> str:
+    short = function.rpartition(".")[2]
+    for name in (f"{short}.{argument}", function, short):
         for base in type(value).__mro__:
             lead = OBJECTS.get(f"{name}.{base.__name__}")
             if lead is not None:

@@ -13,6 +13,7 @@ from ..._core.findings import Finding, warn_of
 from ..data import SectionData
 from ..findings import Inspection, places
 from ..phase import Phase
+from ..read import RecordingLike, as_recording
 from ..recording import Recording, Trial
 from ..smoothing import FEWEST
 from . import differences, failures
@@ -33,7 +34,7 @@ _TEXTS = {
 
 @checked
 def check_recording(
-    recording: Recording,
+    recording: RecordingLike,
     *,
     inputs: OptionalNames = (),
     outputs: OptionalNames,
@@ -50,7 +51,7 @@ def check_recording(
 
     **Arguments:**
 
-    - `recording`: the recording.
+    - `recording`: the recording, or the path of its file, or a table (`hj.Recording.from_frame`).
     - `inputs`, `outputs`: names of signals; others are not inspected. Default of `inputs`: none.
     - `phase`, `data`: phase and data at the sections, of this recording or of the one that an
       inspection returned. Default: None.
@@ -71,6 +72,7 @@ def check_recording(
     """
     inputs = tuple(inputs)
     outputs = tuple(outputs)
+    recording = as_recording(recording)
     require_apart(inputs, outputs)
     names = [
         name

@@ -167,7 +167,7 @@ KEYWORDS = {
         ),
     },
     "continuation": {
-        "pass its name and range: `hj.continuation(cycle, 'k', (low, high))`": (
+        "pass its range by its name: `hj.continuation(cycle, k=(low, high))`": (
             "parameter icp par active_parameter continuation_parameter"
         ),
         "use `range`, (low, high)": (
@@ -188,7 +188,7 @@ KEYWORDS = {
         ),
     },
     "sweep": {
-        "pass the values by name: `hj.sweep(system, {'k': values})`": (
+        "pass the values by name: `hj.sweep(system, k=values)`": (
             "parameter range grid"
         ),
     },
@@ -213,9 +213,6 @@ KEYWORDS = {
 """What to do instead of an argument that a function has not."""
 
 NEEDS = {
-    "continuation.range": "(low, high), as in `hj.continuation(cycle, 'k', (0.1, 0.5))`, with the "
-    "value of the cycle's system between them",
-    "sweep.values": "values by name, as in `hj.sweep(system, {'k': [0.1, 0.5]})`",
     "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
     "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
     "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",

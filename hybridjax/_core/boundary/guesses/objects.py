@@ -133,14 +133,16 @@ OBJECTS = {
     "fit_series.LDTP": "are the model and the data in the wrong order?",
     "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
     "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
-    "identify_recording.int": "it is the event at which cycles begin, such as "
+    "simulate.chart.float": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
+    "simulate.chart.int": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
+    "identify_recording.sections.int": "it is the event at which cycles begin, such as "
     "`hj.Crossing('y', 'falling')`; `n_sections` is a number",
     "Guess.dict": "pass the values in the order of the chart's states",
     "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
     "multisine.AbstractSections": "pass `sections.n_sections`",
     "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
     "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
-    "sweep.str": "pass the values by name: `hj.sweep(system, {'k': values})`",
+    "sweep.str": "pass the values by name: `hj.sweep(system, k=values)`",
     "save.Showable": "`hj.save('name.npz', result)` takes the name first",
     "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
     "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
@@ -160,5 +162,5 @@ OBJECTS = {
     "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
 }
-"""For a function, and the type of the object that it was given, what to do. A given type also
-stands for those derived from it."""
+"""For a function, or one of its arguments, and the type of the object that it was given, what to
+do. A given type also stands for those derived from it."""
