@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
@@ -81,11 +82,12 @@ class Flow(Showable, eqx.Module):
     right after an event. All numbers of a flow that failed are NaN, and so are those of events that
     did not happen.
 
-    **Fields:** `t`, `state`, `chart`: time, state (n,) and index of the chart at the end. `result`:
-    a `Result` code. `event_times` (E,), `event_index` (E,): times of the first E events, and
-    indices of their transitions (-1 for none). `before`, `after` (E, d): the states before and
-    after their resets. `count`: number of all events. `trajectory`: steps and dense states, of a
-    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start and end.
+    **Fields:** `t`, `state`, `chart`: time, state (n,) and index of the chart at the end;
+    `flow["y"]` is a state by its name. `result`: a `Result` code. `event_times` (E,), `event_index`
+    (E,): times of the first E events, and indices of their transitions (-1 for none). `before`,
+    `after` (E, d): the states before and after their resets. `count`: number of all events.
+    `trajectory`: steps and dense states, of a single flow that JAX does not trace; otherwise None.
+    `findings`: doubts about its start and end.
     """
 
     t: Float[Array, "*L"]
@@ -126,6 +128,25 @@ class Flow(Showable, eqx.Module):
                 "`event_index`, `before`, `after` and `at(times)` here."
             )
         return self.trajectory
+
+    def __getitem__(self, name: str) -> Float[Array, "*L"]:
+        """A state at the end by its name, `flow["yM"]`, differentiable as `state` is; NaN in charts
+        without it.
+
+        **Raises:** `DefinitionError` for a state that no chart has.
+        """
+        s = self.structure
+        require_among("state", [name], s.state_names())
+        index = [
+            chart.states.index(name) if name in chart.states else -1
+            for chart in s.charts
+        ]
+        xp = namespace(self.state)
+        places = xp.asarray(index)[self.chart]
+        values = xp.take_along_axis(
+            self.state, xp.maximum(places, 0)[..., None], axis=-1
+        )[..., 0]
+        return xp.where(places < 0, np.nan, values)
 
     @property
     def system(self) -> HybridSystem:
@@ -249,8 +270,9 @@ def flow(
     - `throw`: raise an error if the flow ends early. Default: True. With False, and inside of JAX's
       transformations, `result` has the reason, and times and states are NaN.
 
-    **Returns:** a `Flow`: `t`, `state` and `chart` at the end; `event_times`, `event_index`,
-    `before` and `after` of the first `max_events` events; `result`; and `at(times)`.
+    **Returns:** a `Flow`: `t`, `state` and `chart` at the end, `flow["y"]`; `event_times`,
+    `event_index`, `before` and `after` of the first `max_events` events; `result`; and
+    `at(times)`.
 
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` if the end is not reached,
     for grazing, Zeno, blow-up and the limit on steps, if `throw`.
@@ -260,12 +282,12 @@ def flow(
     ```python
     start = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
     landing = hj.flow(hopper, start, "touchdown", within=5.0)
-    print(landing.t, landing.state)
+    print(landing.t, landing["yM"])
 
     import jax
 
     def height(k):
-        return hj.flow(hopper.replace(k=k), start, 3.0).state[0]
+        return hj.flow(hopper.replace(k=k), start, 3.0)["yM"]
 
     print(jax.grad(height)(10.0))
     ```

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import equinox as eqx
-import numpy as np
-from jaxtyping import Complex
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import (
@@ -27,9 +25,10 @@ from .._core.boundary.kinds import (
 from .._core.findings import Finding, print_findings, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from .._core.showable import WithMultipliers
 from .._core.text import listed
 from ..errors import DefinitionError
+from ..identify.fit import OfFit
+from ..identify.multiplier_estimate import OfMultiplierFit
 from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
 from ..identify.series.records import SLOW, PreparedRecords
@@ -64,7 +63,7 @@ MEANING = (
 _MOST_NATURAL = 4
 
 
-class Identification(WithMultipliers, eqx.Module):
+class Identification(OfMultiplierFit, eqx.Module):
     """The results of `identify_recording`, step by step.
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `findings`
@@ -72,7 +71,8 @@ class Identification(WithMultipliers, eqx.Module):
     first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response
     curve of events alone under one input (else None); `diagnosis`.
 
-    Functions that take a fit or data take it, too.
+    It has `multipliers`, `modulus`, `standard_errors`, `interval`, `contains` and `compare` of the
+    fit. Functions that take a fit or data take it, too.
     """
 
     _stands_for: ClassVar = ("fit", "data")
@@ -110,11 +110,6 @@ class Identification(WithMultipliers, eqx.Module):
         report = importlib.import_module("hybridjax.apps.identify")
         return report.write_report(folder, self, formats)
 
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " d"]:
-        """Those of the fit."""
-        return self.fit.multipliers
-
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]
         results = [
@@ -128,13 +123,14 @@ class Identification(WithMultipliers, eqx.Module):
         return "\n".join(results)
 
 
-class NaturalIdentification(WithMultipliers, eqx.Module):
+class NaturalIdentification(OfFit, eqx.Module):
     """The results of `identify_recording` without inputs, step by step.
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `phase`; `data`,
     at the sections; `fit`, the `NaturalMultipliers`; `findings` of all steps.
 
-    Functions that take such data take it, too.
+    It has `multipliers`, `modulus`, `standard_errors` and `interval` of the fit. Functions that
+    take such data take it, too.
     """
 
     _stands_for: ClassVar = ("fit", "data")
@@ -156,11 +152,6 @@ class NaturalIdentification(WithMultipliers, eqx.Module):
         """
         report = importlib.import_module("hybridjax.apps.identify")
         return report.write_report(folder, self, formats)
-
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " d"]:
-        """Those of the fit."""
-        return self.fit.multipliers
 
     def __repr__(self) -> str:
         findings = [x for x in self.findings if x not in self.fit.findings]
