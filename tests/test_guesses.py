@@ -128,6 +128,22 @@ hj.plot.htf([model, model])
 hj.experiments.add_noise(data, 1e-5)
 cycle.simultaneous_events()
 repr(hj.explore(hopper, "k"))
+hj.find_limit_cycle(hopper, (2.0, 0.0, 1.0, 0.0))
+hj.find_limit_cycle(hopper, {"yM": 2.0, "vM": 0.0, "ym": 1.0, "vm": 0.0})
+hj.simulate(hopper, [2.0, 0.0, 1.0, 0.0], 0.5)
+hj.simulate(hj.models.VanDerPol(), {"x": 2.0, "v": 0.0}, 1.0)
+hj.simulate(hopper, duration=0.5)
+hj.flow(hopper, cycle, 0.5)["yM"]
+hj.sweep(hopper, k=10.0)
+hj.continuation(cycle, k=(9.99, 10.01))
+hj.linearize(cycle, "touchdown").multipliers
+hj.identify_recording(rec.to_pandas(), apex, "u", "yM", n_sections=8, order=2)
+hj.Recording(rec.to_pandas())
+hj.Recording({"time": rec.time, "u": rec["u"]})
+result.interval()
+result.standard_errors
+result.contains(cycle)
+result.compare(fit).p_value
 """
 
 LEAD = """
@@ -167,11 +183,9 @@ hj.fit_multipliers(est)                                 -> hj.select_order
 hj.fit_multipliers(est, poles=2)                        -> `order`
 hj.fit_series(rec, order=2)                             -> hj.identify_recording
 hj.fit_model(hopper, est, "k")                          -> ObservedHTF
-hj.identify_recording("trial.csv", apex, inputs="u", outputs="yM") -> hj.read_recording
 hj.validate(data, model)                                -> wrong order
 hj.save(fit, "fit.npz")                                 -> wrong order
 hj.save("cycle.npz", cycle)                             -> cycle.to_pandas()
-hj.sweep(hopper, k=[8, 9])                              -> {'k': values}
 cycle.T                                                 -> `period`
 cycle.is_stable                                         -> `stable`
 cycle.eigenvalues                                       -> `multipliers`
@@ -200,7 +214,7 @@ hj.validate(fit, data, cv=5)                            -> hold_out
 hj.validate(fit, data).r2                               -> `validation.fit`
 hj.KFold(5)                                             -> hold_out
 hj.sweep(hopper, param_grid={"k": [8.0]})               -> `values`
-hj.sweep(hopper, "k", [8.0, 9.0])                       -> {'k': values}
+hj.sweep(hopper, "k", [8.0, 9.0])                       -> hj.sweep(system, k=values)
 rec.plot_psd()                                          -> welch
 rec.heel_strikes                                        -> recording.mark
 rec.drop_channels("u")                                  -> hj.Recording(time
@@ -230,7 +244,6 @@ hj.identify_recording(rec, sections, inputs="u", outputs="yM") -> its `anchor`
 hj.identify_recording(rec, hj.ClockPhase(8), inputs="u", outputs="yM") -> hj.AtEvent('tick')
 hj.read_recording(rec.to_pandas())                      -> from_frame
 hj.Recording(rec.time, rec["u"])                        -> {'name': samples}
-hj.continuation(cycle, k=(8, 12))                       -> (low, high)
 hj.multisine(sections)                                  -> sections.n_sections
 hj.simulate(hopper, cycle, 2.0)                         -> cycle.trajectory
 hj.save(fit)                                            -> takes the name first
@@ -243,8 +256,8 @@ hj.find_cycle(hopper)                                   -> use `hj.find_limit_cy
 hj.find_limit_cycle(hj.models.VerticalHopper)           -> `VerticalHopper()`
 hj.continuation(cycle, "k")                             -> hj.continuation(cycle, 'k', (0.1, 0.5))
 hj.continuation(cycle, "k", 9.0)                        -> (low, high)
-hj.continuation(cycle, stifness=(8, 9))                 -> it has `cycle`
-hj.continuation(cycle, retentio=(0.1, 0.9))             -> hj.continuation(cycle, 'retention'
+hj.continuation(cycle, stifness=(8, 9))                 -> k=(low, high)
+hj.continuation(cycle, retentio=(0.1, 0.9))             -> hj.continuation(cycle, retention=
 hj.linearize(cycle, "yM")                               -> hj.Crossing('yM', 'falling')
 hj.linearize(cycle)                                     -> hj.Crossing('yM', 'falling')
 hj.identify_recording(rec, "yM", inputs="u", outputs="yM") -> hj.Crossing('yM', 'falling')
@@ -274,7 +287,7 @@ hj.models.Lorenz()                                      -> from_functions
 hj.period_doubling(cycle)                               -> branch.points
 hj.continuation(cycle, "k", bounds=(8, 12))             -> use `range`
 hj.continuation(cycle, "k", (8, 12), NMX=100)           -> `max_points`
-hj.continuation(cycle, "k", (8, 12), ICP=1)             -> its name and range
+hj.continuation(cycle, "k", (8, 12), ICP=1)             -> its range by its name
 hj.linearize(cycle, sections, ts=0.1)                   -> no step of time
 hj.identify_recording(rec, apex, sections=16)           -> `n_sections`
 hj.plot.bode(est, dB=True)                              -> `log=True`
@@ -296,9 +309,7 @@ hj.design(cycle)                                        -> hj.optimal_design
 hj.required_duration(result)                            -> plan.cycles_for
 hj.report(result)                                       -> result.write_report
 result.predict(rec)                                     -> hj.validate(result, data)
-result.confidence_interval()                            -> `fit.interval`
-result.interval()                                       -> `fit.interval`
-result.standard_errors                                  -> `fit.standard_errors`
+result.confidence_interval()                            -> `interval`
 fit.multipliers_ci                                      -> `interval`
 fit.std                                                 -> `standard_errors`
 cycle.evaluate(0.3)                                     -> cycle.trajectory()
@@ -317,6 +328,26 @@ hj.identify_recording([rec, rec], apex, "u", "yM")      -> hj.Recording.join
 hj.identify_subjects([rec], apex, inputs="u")           -> functools.partial(
 hj.recordings.Population([fit, fit])                    -> Population.from_fits
 hj.fit_model(hopper, result, "k")                       -> ObservedSeries(result.data
+hj.sweep(hopper, stiffness=[9.0, 10.0])                 -> k=values
+hj.sweep(hopper)                                        -> hj.sweep(system, m=[0.1, 0.5])
+hj.sweep(hopper, {"k": [9.0]}, k=[9.0])                 -> given twice
+hj.sweep(hopper, hj.scale.SweepPoints({"k": [9.0]}), b=[5.0]) -> leave out `b`
+hj.continuation(cycle, k=(9, 11), b=(4, 5))             -> hj.sweep
+hj.continuation(cycle, k=9.0)                           -> (low, high)
+hj.find_limit_cycle(hopper, stiffness=9.0)              -> system.replace(k=
+hj.find_limit_cycle(hopper, (2.0, 0.0, 1.0))            -> 'flight' has yM, vM, ym, vm
+hj.find_limit_cycle(hopper, {"yM": 2.0, "x": 0.0})      -> 'stance' has yM, vM
+hj.find_limit_cycle(lambda t, y: y)                     -> hj.HybridSystem.from_functions
+hj.find_limit_cycle("VerticalHopper")                   -> hj.models.VerticalHopper()
+hj.simulate(hopper, 1.0)                                -> duration=1.0
+hj.simulate(hopper, [2.0, 0.0, 1.0, 0.0])               -> give the duration
+hj.flow(hopper, cycle, t1=1.0)                          -> `until`
+hj.flow(hopper, cycle, "yM", within=1.0)                -> hj.Crossing('yM', 'falling')
+hj.flow(hopper, cycle, 0.5).yM                          -> `['yM']`
+hj.identify_recording(3, apex, "u", "yM")               -> hj.read_recording
+hj.identify_recording("nowhere.csv", apex, "u", "yM")   -> cannot read 'nowhere.csv'
+hj.Recording({"times": rec.time, "u": rec["u"]})        -> no column 'time'
+hj.Recording(rec.time)                                  -> {'name': samples}
 setattr(hopper, "k", 9.0)                               -> system.replace(k=9.0)
 setattr(hopper, "stiffness", 9.0)                       -> use `k`
 setattr(cycle, "period", 9.0)                           -> hj.find_limit_cycle(system)

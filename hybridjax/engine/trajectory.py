@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, host_first
 from .._core.executor import is_traced, namespace
@@ -50,6 +51,7 @@ _SAME = 1e-9
 _MOMENT = 1e-6
 
 
+@leading_on
 class Event(NamedTuple):
     """One event of a trajectory."""
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Complex, Float
 
 from .._core.boundary.checked import checked, checked_methods, taken_parameters
 from .._core.boundary.kinds import Count, Share, Vector
+from .._core.boundary.members import leading_on
 from .._core.html import COLORS, Curve as Line, card, picture, table
 from .._core.memo import remembered
 from .._core.precision import require_x64
@@ -53,6 +54,7 @@ Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 
+@leading_on
 class BranchPoint(NamedTuple):
     """A point of a branch with a multiplier on the unit circle."""
 
@@ -73,6 +75,7 @@ class BranchPoint(NamedTuple):
         return self.multipliers[off_circle < SAME]
 
 
+@leading_on
 class BranchEnd(NamedTuple):
     """The end of a branch, and the reason."""
 

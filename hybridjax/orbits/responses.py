@@ -19,6 +19,7 @@ from jaxtyping import Complex, Float, Inexact
 from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, one_program
 from .._core.executor import (
@@ -77,6 +78,7 @@ class PhaseCurve(Showable, eqx.Module):
         return f"cycles / ({unit} {time})" if unit else f"cycles / {time} / input"
 
 
+@leading_on
 class Impulse(NamedTuple):
     """The response to an input that acts at an event, through its guard or reset: there, the input
     changes the phase or the amplitude by `weight` times its value."""
@@ -87,6 +89,7 @@ class Impulse(NamedTuple):
     """By name of the input."""
 
 
+@leading_on
 class Locked(NamedTuple):
     """A state in which phases move together: `lead` of the push, in cycles, and the `rate` at which
     deviations grow, per time and strength of the push; negative where it is stable."""

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
+from .._core.boundary.members import leading_on
 from ..errors import DefinitionError
 from ..experiments.record import HasRecords, SectionSeries, uninterrupted_records
 from ..identify.denominator import Covariance
@@ -30,6 +31,7 @@ _SHORTEST_END = 12
 _AS_GOOD = 0.02
 
 
+@leading_on
 class HeldOut(NamedTuple):
     """A fit to the first part of each record, tried on the last."""
 
@@ -40,6 +42,7 @@ class HeldOut(NamedTuple):
         return f"{self.fit}\n{self.validation}"
 
 
+@leading_on
 class HeldOutOrders(NamedTuple):
     """How well fits of each order predict held-out cycles. Printing it shows a table.
 

@@ -14,6 +14,7 @@ from scipy.optimize.elementwise import find_root
 from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Plain
 from .._core.findings import Finding, print_findings
 from .._core.showable import Showable
@@ -47,6 +48,7 @@ NamedColumns: TypeAlias = Annotated[
 """A table of pandas or pyarrow, or a dictionary of arrays."""
 
 
+@leading_on
 class Trial(eqx.Module):
     """One uninterrupted run of the instruments.
 

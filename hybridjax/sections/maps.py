@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from .._core.arguments import require_axes, require_index
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.compilation import host_first, on_the_host
 from .._core.executor import is_traced, namespace, put
@@ -31,6 +32,7 @@ from .placed import PlacedSections, SectionsLike, followed_at_once
 _PATIENCE = 100
 
 
+@leading_on
 class Arrival(NamedTuple):
     """The time and the state at which a trajectory arrives on the second section of a section map.
     If it does not arrive, these and their derivatives are NaN."""

@@ -74,6 +74,17 @@ KEYWORDS = {
         ),
         "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=20_000)`": "settings",
     },
+    "flow": {
+        "use `until`, the time at the end": (
+            "t1 t_end t_final duration t_span t stop tf end length"
+        ),
+        "a `Guess` has the time at the start: `hj.Guess(chart, state, time)`": (
+            "t0 t_start time"
+        ),
+        "`start` is the chart, the state and the time: `hj.Guess(chart, state, time)`": (
+            "chart state"
+        ),
+    },
     "simulate": {
         "`cycle.trajectory(periods)` follows a cycle": "n_cycles cycles periods",
         "events are transitions of the system, as in `hj.HybridSystem.from_functions(states, "

@@ -35,6 +35,14 @@ MAKERS = {
 
 STEPS = {
     (
+        "HybridSystem",
+        "function",
+    ): "`hj.HybridSystem.from_functions(('x', 'v'), field)` makes one of a function (t, q)",
+    (
+        "HybridSystem",
+        "str",
+    ): "models are objects, such as `hj.models.VerticalHopper()`",
+    (
         "Phase",
         "ClockPhase",
     ): "recordings have no clock; its ticks are events: "
