@@ -1,5 +1,8 @@
 """Short forms of arguments: what they return is that of the long ones."""
 
+import functools
+import pathlib
+
 import jax
 import numpy as np
 import pytest
@@ -203,3 +206,37 @@ def test_functions_of_a_system_leave_out_last_arguments():
     # v = -1/2 + 3/2 exp(-2 t) reaches 0 at t = ln(3) / 2, then begins at 1/2: t = ln(2) / 2 later.
     events = [event.time for event in path.events]
     assert np.allclose(events[:2], [np.log(3) / 2, np.log(6) / 2], atol=1e-8)
+
+
+def test_subjects_are_named_in_a_list_or_with_their_fits(cycle, walk):
+    other = hj.testing.add_artifacts(walk, OUTPUTS, noise=1e-4)
+    a, b = (
+        hj.identify_recording(x, APEX, "u", OUTPUTS, n_sections=8, order=2)
+        for x in (walk, other)
+    )
+    people = hj.recordings.Population
+    long = people.from_fits([a.fit, b.fit], {"subject": ["S1", "S2"]}).to_pandas()
+    assert people.from_fits([a, b], ["S1", "S2"]).to_pandas().equals(long)
+    assert people.from_fits({"S1": a, "S2": b}).to_pandas().equals(long)
+
+
+def test_all_signals_but_the_inputs_are_checked(walk):
+    broken = hj.testing.add_artifacts(walk, "vM", spikes=0.01)
+    long = hj.recordings.check_recording(broken, inputs="u", outputs=OUTPUTS)
+    short = hj.recordings.check_recording(broken, inputs="u")
+    assert short.findings == long.findings
+
+
+def test_a_study_takes_a_table_and_the_options_of_each_recording(
+    tmp_path, monkeypatch, walk
+):
+    monkeypatch.chdir(tmp_path)
+    walk.to_pandas().to_csv("S1.csv", index=False)
+    pathlib.Path("subjects.csv").write_text("file,subject\nS1.csv,S1\n")
+    options = dict(sections=APEX, inputs="u", outputs=OUTPUTS, n_sections=8, order=2)
+    identify = functools.partial(hj.identify_recording, **options)
+    long = hj.identify_subjects("subjects.csv", "long", identify)
+    table = {"file": ["S1.csv"], "subject": ["S1"]}
+    short = hj.identify_subjects(table, "short", **options)
+    assert_array_equal(short.fits[0].multipliers, long.fits[0].multipliers)
+    assert list(short.population.table["subject"]) == ["S1"]

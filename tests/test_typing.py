@@ -114,6 +114,7 @@ ALLOWED = {
     "MuJoCoPlant.set_state",
     "PlantCycle.__init__.state",
     "SubjectStudy.__init__.results",
+    "identify_subjects.options",
 }
 
 

@@ -532,6 +532,8 @@ def _count_taken(function: Callable[..., Any]) -> int:
     # (Others with defaults belong to the author, as k in `lambda t, q, k=k: ...`.)
     by_position = [x for x in parameters if x.kind <= x.POSITIONAL_OR_KEYWORD]
     taken = [x for x in by_position if x.default is x.empty or x.name in ("u", "p")]
+    if len(taken) == 3 and taken[2].name == "p":  # (It would get the inputs.)
+        return 4
     return min(max(len(taken), 2), 4)
 
 

@@ -37,7 +37,7 @@ def check_recording(
     recording: RecordingLike,
     *,
     inputs: OptionalNames = (),
-    outputs: OptionalNames,
+    outputs: OptionalNames | None = None,
     phase: Phase | None = None,
     data: SectionData | None = None,
 ) -> Inspection:
@@ -52,7 +52,8 @@ def check_recording(
     **Arguments:**
 
     - `recording`: the recording, or the path of its file, or a table (`hj.Recording.from_frame`).
-    - `inputs`, `outputs`: names of signals; others are not inspected. Default of `inputs`: none.
+    - `inputs`, `outputs`: names of signals; others are not inspected. Default of `inputs`: none; of
+      `outputs`: all signals that are no inputs.
     - `phase`, `data`: phase and data at the sections, of this recording or of the one that an
       inspection returned. Default: None.
 
@@ -71,8 +72,9 @@ def check_recording(
     **Before:** `hj.read_recording`. **After:** `hj.recordings.estimate_phase`.
     """
     inputs = tuple(inputs)
-    outputs = tuple(outputs)
     recording = as_recording(recording)
+    others = [name for name in recording.signals if name not in inputs]
+    outputs = tuple(others if outputs is None else outputs)
     require_apart(inputs, outputs)
     names = [
         name

@@ -192,10 +192,9 @@ KEYWORDS = {
         ),
         "the branch goes to both ends of the range": "direction backward forward bothside",
     },
-    "identify_subjects": {
-        "`identify=functools.partial(hj.identify_recording, sections=..., inputs=..., "
-        "outputs=...)` identifies each recording": (
-            "inputs outputs sections order n_sections"
+    "natural_multipliers": {
+        "`hj.identify_recording(recording, sections, outputs=...)` takes recordings": (
+            "outputs sections n_sections inputs signals bandwidth"
         ),
     },
     "sweep": {
@@ -225,6 +224,9 @@ KEYWORDS = {
 
 NEEDS = {
     "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
+    "validate.data": "data to which the model was not fitted: `hj.run_experiments` makes some, and "
+    "`hj.identify_recording(recording, ...).data` those of another recording",
+    "Population.values": "`hj.recordings.Population.from_fits(fits, subjects)` takes fits",
     "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
     "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
     "estimate_phase.sections": "an event that happens once a cycle, such as "

@@ -104,6 +104,18 @@ STEPS = {
         "LimitCycle",
     ): "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
     ("HasRecords", "LDTP"): "are `model` and `data` in the wrong order?",
+    (
+        "SectionData",
+        "Recording",
+    ): "`hj.identify_recording(recording, sections, outputs=...)` takes recordings",
+    (
+        "HasRecords",
+        "str",
+    ): "`hj.identify_recording(path, ...).data` are those of a recording",
+    (
+        "HasRecords",
+        "Path",
+    ): "`hj.identify_recording(path, ...).data` are those of a recording",
     ("ParameterFit", "MultiplierFit"): "`other.compare(fit)` compares multipliers",
     ("Recording", "ExperimentData"): "`hj.fit_series(data, order)` takes such data",
     (
@@ -132,7 +144,7 @@ OBJECTS = {
     "optimal_design.float": "name the signal: `limit={'u': 0.01}` is its largest rms",
     "identify_recording.list": "`hj.Recording.join(recordings)` makes trials of one recording; of "
     "several subjects, `hj.identify_subjects(table, folder)`",
-    "Population.list": "`hj.recordings.Population.from_fits(fits, labels)` takes fits",
+    "Population.list": "`hj.recordings.Population.from_fits(fits, subjects)` takes fits",
     "responses.str": "`cycle.responses().curve('u')` is that to one input",
     "fluctuations.float": "name the signal: `white={'y': 0.01}`",
     "fit_model.Identification": "`hj.fitting.ObservedSeries(result.data, sections)` makes one",
@@ -146,7 +158,10 @@ OBJECTS = {
     "identify_recording.sections.int": "it is the event at which cycles begin, such as "
     "`hj.Crossing('y', 'falling')`; `n_sections` is a number",
     "Guess.dict": "pass the values in the order of the chart's states",
-    "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
+    "identify_subjects.list": "name the files: `hj.identify_subjects({'file': files, 'subject': "
+    "names}, folder, ...)`; `hj.recordings.Population.from_fits(fits, subjects)` compares fits",
+    "cycle.x.tuple": "pass two names: `hj.plot.cycle(cycle, x, y)`",
+    "cycle.x.list": "pass two names: `hj.plot.cycle(cycle, x, y)`",
     "multisine.AbstractSections": "pass `sections.n_sections`",
     "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
     "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
