@@ -185,6 +185,22 @@ def test_a_result_has_what_its_fit_has(cycle, walk):
     assert result.compare(cycle).p_value == result.fit.compare(cycle).p_value
 
 
+def test_a_field_is_the_system_of_one_chart():
+    def field(t, q):
+        return (q[1], (1 - q[0] ** 2) * q[1] - q[0])
+
+    system = hj.HybridSystem.from_functions(("x", "v"), field)
+    start = {"x": 2.0, "v": 0.0}
+    long = hj.find_limit_cycle(system, start)
+    assert_array_equal(hj.find_limit_cycle(field, start).multipliers, long.multipliers)
+    unnamed = hj.find_limit_cycle(field, (2.0, 0.0))
+    assert list(unnamed.state) == ["x0", "x1"]
+    assert_array_equal(unnamed.multipliers, long.multipliers)
+    path = hj.simulate(field, start, 1.0)
+    assert_array_equal(path.after, hj.simulate(system, start, 1.0).after)
+    assert hj.flow(field, start, 1.0)["v"] == hj.flow(system, start, 1.0)["v"]
+
+
 def test_functions_of_a_system_leave_out_last_arguments():
     def field(t, q):
         return (q[1], (1 - q[0] ** 2) * q[1] - q[0])

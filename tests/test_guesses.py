@@ -131,6 +131,7 @@ hj.experiments.add_noise(data, 1e-5)
 cycle.simultaneous_events()
 repr(hj.explore(hopper, "k"))
 hj.find_limit_cycle(hopper, (2.0, 0.0, 1.0, 0.0))
+hj.simulate(lambda t, y: [y[1], -y[0]], [1.0, 0.0], 6.28)
 hj.find_limit_cycle(hopper, {"yM": 2.0, "vM": 0.0, "ym": 1.0, "vm": 0.0})
 hj.simulate(hopper, [2.0, 0.0, 1.0, 0.0], 0.5)
 hj.simulate(hj.models.VanDerPol(), {"x": 2.0, "v": 0.0}, 1.0)
@@ -338,7 +339,7 @@ hj.recordings.natural_multipliers(rec)                  -> hj.identify_recording
 rec.trials[0].plot()                                    -> recording.plot()
 traj.events[0].t                                        -> `time`
 traj.events[0].state                                    -> `event.before`
-hj.validate(result)                                     -> `hj.identify_recording(recording, ...).data`
+hj.validate(result)                                     -> to which the model was not fitted
 hj.validate(fit, "trial.csv")                           -> hj.identify_recording
 hj.fit_series("trial.csv", order=2)                     -> hj.identify_recording
 hj.optimal_design(model, noise=1e-4).write("a.csv")     -> plan.design.write

@@ -51,6 +51,7 @@ hj.Recording({"time": [0.0, 1.0], "y": [0.0, 1.0]}).signals
 hj.find_limit_cycle(hopper, (2.0, 1.0, 0.0, 0.0), section="touchdown")
 hj.simulate(hopper, {"yM": 2.0, "vM": 1.0, "ym": 0.0, "vm": 0.0}, 1.0)
 hj.simulate(hopper, duration=1.0)
+hj.find_limit_cycle(lambda t, q: (q[1], -q[0]), (2.0, 0.0)).multipliers
 float(hj.flow(hopper, [2.0, 1.0, 0.0, 0.0], 1.0)["yM"])
 hj.sweep(hopper, k=[9.0, 10.0], b=5.0)
 hj.continuation(cycle, k=(9.0, 11.0)).stable

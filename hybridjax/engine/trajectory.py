@@ -29,7 +29,7 @@ from .._core.text import folded, number, signal_values
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system, evaluating
 from ..systems.quotient import check_symmetry
-from ..systems.start import StateLike, guess_of, own_guess
+from ..systems.start import StateLike, SystemLike, guess_of, own_guess, system_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from . import kernels
@@ -297,7 +297,7 @@ def observed(
 
 @checked
 def simulate(
-    system: HybridSystem,
+    system: SystemLike,
     chart: str | Guess | StateLike | None = None,
     state: Annotated[Numbers, Reals()] | None = None,
     duration: Duration | None = None,
@@ -312,7 +312,8 @@ def simulate(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`.
+    - `system`: a `HybridSystem`; with a state, a field (t, q) of one chart without events stands
+        for it.
     - `chart`, `state`, `time`: the start, given by the name of a chart, its states (n,) in order,
         and the time (Default: 0). A guard that is zero or negative there is not an event: a ball
         that starts below the floor falls on. `findings` of the trajectory list such guards. A
@@ -345,6 +346,7 @@ def simulate(
     """
     require_x64(system, settings)
     settings = Settings() if settings is None else settings
+    system = system_of(system, state if chart is None else chart)
     system = settings.system(system)
     check_system(system)
     check_symmetry(system)

@@ -31,7 +31,7 @@ from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
 from ..systems.quotient import check_symmetry
 from ..systems.solver import Radau
-from ..systems.start import StateLike, guess_of
+from ..systems.start import StateLike, SystemLike, guess_of, system_of
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
@@ -102,7 +102,7 @@ _DISTANT = 1e3
 @working("find_limit_cycle")
 @uncollected()
 def find_limit_cycle(
-    system: HybridSystem,
+    system: SystemLike,
     guess: Guess | LimitCycle | StateLike | None = None,
     *,
     section: SectionLike | None = None,
@@ -126,7 +126,8 @@ def find_limit_cycle(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`: one of `hj.models`, or your own.
+    - `system`: a `HybridSystem`: one of `hj.models`, or your own. With a state as `guess`, a field
+        (t, q) of one chart without events stands for it (`hj.HybridSystem.from_functions`).
     - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
         A state, in order or by name, stands for a `Guess` where only one chart has such states.
         With a cycle, leave out `settle` and `max_period`; the search begins at the same phase of
@@ -186,6 +187,7 @@ def find_limit_cycle(
     `hj.run_experiments`, `hj.continuation`, `hj.plot.cycle`.
     """
     settings = Settings() if settings is None else settings
+    system = system_of(system, guess)
     section = None if section is None else as_section(section)
     if not isinstance(guess, Guess | LimitCycle | None):
         guess = guess_of(Structure(system), guess, "`guess`")

@@ -45,7 +45,7 @@ from ..engine.trajectory import (
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system
 from ..systems.quotient import check_symmetry
-from ..systems.start import StateLike, guess_of
+from ..systems.start import StateLike, SystemLike, guess_of, system_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem
 from ..systems.transition import SAME_TIME
@@ -230,7 +230,7 @@ class _Request(eqx.Module):
 
 @checked
 def flow(
-    system: HybridSystem,
+    system: SystemLike,
     start: Guess | Flow | LimitCycle | StateLike,
     until: Scalar | str | AtEvent | Crossing | None = None,
     *,
@@ -252,7 +252,8 @@ def flow(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`.
+    - `system`: a `HybridSystem`; with a state, a field (t, q) of one chart without events stands
+      for it.
     - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
       that ended there. A `Guess` with states (L, n) starts L flows. A state (n,), in order or by
       name, stands for a `Guess` where only one chart has such states, and a `LimitCycle` for its
@@ -307,7 +308,7 @@ def flow(
 
 
 def requested(
-    system: HybridSystem,
+    system: SystemLike,
     start: Guess | Flow | LimitCycle | StateLike,
     until: Any,
     events: int | None,
@@ -323,7 +324,8 @@ def requested(
     """
     require_x64(system, start, settings)
     settings = Settings() if settings is None else settings
-    system = settings.system(system)
+    begin = None if isinstance(start, Flow | LimitCycle) else start
+    system = settings.system(system_of(system, begin))
     settings = settings.filled(_ACCURACY)
     # (Messages name the steps of the settings, which count, too, if they are more.)
     most = max(max_steps, settings.max_steps)

@@ -1,20 +1,52 @@
-"""Where a flow or a search begins, as users give it."""
+"""What moves, and where it begins, as users give it: a system or its field, a state or a guess."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeAlias
 
 import jax
 import numpy as np
 
 from .._core.boundary.kinds import Numbers, Scalar
-from .._core.boundary.values import Reals
+from .._core.boundary.values import Plain, Reals
 from ..errors import DefinitionError
 from .structure import Structure
 from .system import Guess, HybridSystem
 
 
+def _is_field(value: Any) -> bool:
+    of_package = type(value).__module__.partition(".")[0] == __name__.partition(".")[0]
+    return callable(value) and not isinstance(value, type) and not of_package
+
+
+SystemLike: TypeAlias = (
+    HybridSystem | Annotated[Callable[..., Any], Plain("a function", _is_field)]
+)
+"""A system, or the field of one that has a single chart and no events."""
+
 StateLike: TypeAlias = Mapping[str, Scalar] | Annotated[Numbers, Reals("n")]
 """The states of a chart: by name, or in order."""
+
+
+def system_of(system: SystemLike, start: Any) -> HybridSystem:
+    """Return a system: of a field (t, q) that of one chart, with the names of the states at the
+    start, `x` for one without a name, or `x0`, `x1`, ...
+
+    **Raises:** `DefinitionError` for a field without a start.
+    """
+    if isinstance(system, HybridSystem):
+        return system
+    if isinstance(start, Mapping):
+        return HybridSystem.from_functions(tuple(start), system)
+    state = start.state if isinstance(start, Guess) else start
+    if np.ndim(state) == 0:
+        raise DefinitionError(
+            "a function is the field of a system, and needs a state to begin with: give one by "
+            "name, {'x': 2.0, 'v': 0.0}, or make the system by "
+            "`hj.HybridSystem.from_functions(('x', 'v'), field)`."
+        )
+    n = np.shape(state)[-1]
+    names = ("x",) if n == 1 else tuple(f"x{i}" for i in range(n))
+    return HybridSystem.from_functions(names, system)
 
 
 def guess_of(s: Structure, state: StateLike, called: str, time: Any = 0.0) -> Guess:

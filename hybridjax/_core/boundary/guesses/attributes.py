@@ -349,7 +349,7 @@ ATTRIBUTES = {
     },
     "Event": {
         "`event.before` and `event.after` have the states by name": (
-            "state states q x y values jump"
+            "states q x y values jump"
         ),
     },
     "Trial": {
