@@ -108,6 +108,17 @@ def test_a_state_by_name_has_derivatives(hopper):
     assert short == long != 0
 
 
+def test_one_time_needs_no_list(hopper):
+    path = hj.simulate(hopper, STATE, 0.5)
+    charts, states = path.at([0.3])
+    assert path.at(0.3)[0] == charts[0]
+    assert_array_equal(path.at(0.3)[1], states[0])
+    end = hj.flow(hopper, STATE, 0.5)
+    charts, states = end.at([0.3])
+    assert end.at(0.3)[0] == charts[0]
+    assert_array_equal(end.at(0.3)[1], states[0])
+
+
 def test_parameters_of_a_sweep_are_keywords(hopper, cycle):
     values = {"k": [9.9, 10.0], "b": [5.0]}
     long = hj.sweep(hopper, values, guess=cycle)

@@ -132,6 +132,7 @@ cycle.simultaneous_events()
 repr(hj.explore(hopper, "k"))
 hj.find_limit_cycle(hopper, (2.0, 0.0, 1.0, 0.0))
 hj.simulate(lambda t, y: [y[1], -y[0]], [1.0, 0.0], 6.28)
+traj.at(0.5)
 hj.find_limit_cycle(hopper, {"yM": 2.0, "vM": 0.0, "ym": 1.0, "vm": 0.0})
 hj.simulate(hopper, [2.0, 0.0, 1.0, 0.0], 0.5)
 hj.simulate(hj.models.VanDerPol(), {"x": 2.0, "v": 0.0}, 1.0)
@@ -345,6 +346,18 @@ hj.fit_series("trial.csv", order=2)                     -> hj.identify_recording
 hj.optimal_design(model, noise=1e-4).write("a.csv")     -> plan.design.write
 hj.recordings.Population({"a": result})                 -> Population.from_fits
 hj.recordings.Population.from_fits([result, result])    -> ['S1', 'S2']
+hj.sweep("VanDerPol", mu=[1.0, 2.0])                    -> hj.models.VerticalHopper()
+hj.fit_model(hopper, rec, ["k", "b"])                   -> ObservedTrajectory
+hj.simulate(hopper, traj, 1.0)                          -> hj.flow(system, flow, until)
+traj(0.5)                                               -> trajectory.at(times)
+hj.plot.multipliers(cycle.multipliers, fit.multipliers) -> hj.plot.multipliers(true, fit)
+hj.ClockPhase(8, anchor="touchdown")                    -> hj.Crossing(
+hj.KinematicPhase(8, ("yM", "vM"))                      -> hj.KinematicPhase(8, 'y', 'v')
+hj.Guess("flight", {"yM": 2.0})                         -> hj.find_limit_cycle(system, {'y': 2.0
+model.simulate(design)                                  -> simulate_experiments(model, design)
+hj.identify_recording(rec, {"vM": "falling"}, "u", "yM") -> hj.Crossing(
+hj.identify_recording(rec, ("vM", "falling"), "u", "yM") -> hj.Crossing(
+hj.linearize(cycle, ("yM", "falling"))                  -> hj.Crossing('yM', 'falling')
 hj.plot.cycle(cycle, ("yM", "vM"))                      -> hj.plot.cycle(cycle, x, y)
 hj.recordings.Population([fit, fit])                    -> Population.from_fits
 hj.fit_model(hopper, result, "k")                       -> ObservedSeries(result.data

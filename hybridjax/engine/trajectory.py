@@ -171,14 +171,17 @@ class Trajectory(Showable, eqx.Module):
         return t, chart, state
 
     def at(
-        self, t: Annotated[Numbers, Reals("p")]
-    ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p d"]]:
-        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At an
-        event they are those after it.
+        self, t: Annotated[Numbers, Reals("p")] | Scalar
+    ) -> tuple[Int[np.ndarray, "*p"], Float[np.ndarray, "*p d"]]:
+        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At one time
+        they are without that axis; at an event they are those after it.
 
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """
         t = np.asarray(t)
+        if not t.ndim:
+            charts, single = self.at(t[None])
+            return charts[0], single[0]
         begin = self.t[0]
         end = self.t[-1]
         if len(t) and not begin <= t.min() <= t.max() <= end:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Scalar, SignalNames
+from .._core.boundary.values import Plain
 from .._core.executor import Definition, namespace
 from .._core.precision import real
 from .._core.text import fields
@@ -136,7 +137,10 @@ class AtEvent(eqx.Module):
         s.transition_index(self.name)
 
 
-SectionLike: TypeAlias = Crossing | AtEvent | str
+EventName = Annotated[
+    str, Plain("the name of an event", lambda value: isinstance(value, str))
+]
+SectionLike: TypeAlias = Crossing | AtEvent | EventName
 """A single section; an event also by its name."""
 
 

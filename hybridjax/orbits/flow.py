@@ -158,20 +158,24 @@ class Flow(Showable, eqx.Module):
         return namespace(self.result).atleast_1d(self.result)
 
     def at(
-        self, times: Annotated[Numbers, Reals("K")]
-    ) -> tuple[Int[Array, "*L K"], Float[Array, "*L K d"]]:
+        self, times: Annotated[Numbers, Reals("K")] | Scalar
+    ) -> tuple[Int[Array, "*LK"], Float[Array, "*LK d"]]:
         """Charts and states, padded to d numbers, at some times, as accurate as the flow itself and
         differentiable like it. They are NaN at times before its start and after its end, and at all
         times if events coincide whose order matters.
 
-        **Arguments:** `times` (K,).
+        **Arguments:** `times` (K,), or one.
 
-        **Returns:** `charts` (K,), their indices, and `states` (K, d).
+        **Returns:** `charts` (K,), their indices, and `states` (K, d); at one time without that
+        axis.
 
         **Raises:** `DefinitionError` if the system's code has changed since.
         """
         require_x64(self)
         require_as_made(self.system, "this flow was computed")
+        if not np.ndim(times):
+            charts, states = self.at(namespace(times).asarray(times)[None])
+            return charts[..., 0], states[..., 0, :]
         if self.trajectory is not None and not is_traced(times):
             return self._on_steps(np.asarray(times))
         samples = _program(self.request, jnp.asarray(times)).samples

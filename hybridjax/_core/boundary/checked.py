@@ -302,6 +302,10 @@ class _Kinds:
         percent = leads.about_percent(kind, value)
         if percent:
             return percent
+        called = self.function if self.cls is None else self.cls
+        certain = leads.about_argument(called.__qualname__, name, value, args)
+        if certain:
+            return certain
         # (What is given by name is not in the wrong order.)
         positional = [] if by_name else self.in_order[0]
         for (other, other_kind), given in zip(positional, args, strict=False):
@@ -309,8 +313,7 @@ class _Kinds:
                 continue
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
-        called = self.function if self.cls is None else self.cls
-        return leads.about_object(called.__qualname__, kind, value, args, name)
+        return leads.about_object(called.__qualname__, kind, value, args)
 
     @functools.cached_property
     def _names(self) -> "_Names":

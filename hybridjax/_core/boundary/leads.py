@@ -359,15 +359,32 @@ def about_object(
     kind: Kind | None,
     value: Any,
     given: Sequence[Any] = (),
-    argument: str = "",
 ) -> str:
     """Return the call that makes what a function needs instead of a value, or the part of it that
     is needed, as the rest of a sentence; "" if none is known.
 
     **Arguments:** `function`: its name, of a method with its class. `given`: all arguments, whose
-    names the call has. `argument`: the name of the argument.
+    names the call has.
     """
-    return _in_names_of(given, _about_object(function, kind, value, argument))
+    return _in_names_of(given, _about_object(function, kind, value))
+
+
+def about_argument(
+    function: str, argument: str, value: Any, given: Sequence[Any]
+) -> str:
+    """Return what to do where one argument of a function was given a value of some type, as the
+    rest of a sentence; "" if nothing is known.
+
+    **Arguments:** as `about_object`.
+    """
+    lead = _of_type(f"{function.rpartition('.')[2]}.{argument}", value)
+    return "" if lead is None else f": {_in_names_of(given, lead)}"
+
+
+def _of_type(place: str, value: Any) -> str | None:
+    """Return the sentence of the table for a place, and the type of a value."""
+    leads = (OBJECTS.get(f"{place}.{base.__name__}") for base in type(value).__mro__)
+    return next((lead for lead in leads if lead is not None), None)
 
 
 def about_percent(kind: Kind | None, value: Any) -> str:
@@ -379,13 +396,11 @@ def about_percent(kind: Kind | None, value: Any) -> str:
     return f": {value:g} % is {value / 100:g}" if is_share and 5 <= value <= 100 else ""
 
 
-def _about_object(function: str, kind: Kind | None, value: Any, argument: str) -> str:
-    short = function.rpartition(".")[2]
-    for name in (f"{short}.{argument}", function, short):
-        for base in type(value).__mro__:
-            lead = OBJECTS.get(f"{name}.{base.__name__}")
-            if lead is not None:
-                return f": {lead}"
+def _about_object(function: str, kind: Kind | None, value: Any) -> str:
+    for name in (function, function.rpartition(".")[2]):
+        lead = _of_type(name, value)
+        if lead is not None:
+            return f": {lead}"
     wanted = list(classes_in(kind))
     if _is_class_of(value, wanted):
         return f": make one, as `{value.__name__}()`"

@@ -128,6 +128,10 @@ STEPS = {
     ): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
     (
         "AbstractObservation",
+        "Recording",
+    ): "`hj.fitting.ObservedTrajectory(start, times, outputs, values)` makes one of values",
+    (
+        "AbstractObservation",
         "ExperimentData",
     ): "`hj.fitting.ObservedSeries(data, sections)` makes one of data",
 }
@@ -153,11 +157,30 @@ OBJECTS = {
     "fit_series.LDTP": "are the model and the data in the wrong order?",
     "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
     "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
+    "ClockPhase.anchor.str": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "ArcLength.anchor.str": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "KinematicPhase.anchor.str": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "KinematicPhase.position.tuple": "pass two names: `hj.KinematicPhase(8, 'y', 'v')`",
+    "KinematicPhase.position.list": "pass two names: `hj.KinematicPhase(8, 'y', 'v')`",
+    "identify_recording.sections.tuple": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "identify_recording.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "estimate_phase.sections.tuple": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "estimate_phase.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "sample_sections.sections.tuple": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "sample_sections.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "linearize.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "simulate.chart.Trajectory": "`hj.flow(system, flow, until)` goes on from the end of a flow",
+    "__call__.names.float": "`trajectory.at(times)` has the states at any times",
+    "__call__.names.int": "`trajectory.at(times)` has the states at any times",
+    "multipliers.estimates.ndarray": "pass the fit, which has regions: `hj.plot.multipliers(true, "
+    "fit)`",
+    "simulate.u.Design": "`hj.experiments.simulate_experiments(model, design)` runs one on a model",
     "simulate.chart.float": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
     "simulate.chart.int": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
     "identify_recording.sections.int": "it is the event at which cycles begin, such as "
     "`hj.Crossing('y', 'falling')`; `n_sections` is a number",
-    "Guess.dict": "pass the values in the order of the chart's states",
+    "Guess.dict": "pass the values in the order of the chart's states, or such a state in place of "
+    "the guess: `hj.find_limit_cycle(system, {'y': 2.0, 'v': 0.0})`",
     "identify_subjects.list": "name the files: `hj.identify_subjects({'file': files, 'subject': "
     "names}, folder, ...)`; `hj.recordings.Population.from_fits(fits, subjects)` compares fits",
     "cycle.x.tuple": "pass two names: `hj.plot.cycle(cycle, x, y)`",
@@ -165,7 +188,7 @@ OBJECTS = {
     "multisine.AbstractSections": "pass `sections.n_sections`",
     "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
     "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
-    "sweep.str": "pass the values by name: `hj.sweep(system, k=values)`",
+    "sweep.values.str": "pass the values by name: `hj.sweep(system, k=values)`",
     "save.Showable": "`hj.save('name.npz', result)` takes the name first",
     "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
     "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
