@@ -173,8 +173,8 @@ class Trajectory(Showable, eqx.Module):
     def at(
         self, t: Annotated[Numbers, Reals("p")] | Scalar
     ) -> tuple[Int[np.ndarray, "*p"], Float[np.ndarray, "*p d"]]:
-        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At one time
-        they are without that axis; at an event they are those after it.
+        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At one
+        time they are without that axis; at an event they are those after it.
 
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """
