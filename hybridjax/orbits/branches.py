@@ -205,8 +205,9 @@ def continuation(
     - `parameter`: the name of a parameter of the system, or of a part of the system with dots, such
         as `"leg.k"`.
     - `range`: two or more numbers, ascending or descending. The branch ends at the first and the
-        last. It contains a cycle at each of the numbers, and further cycles in between. Without
-        dots in the name, `k=(8, 12)` stands for the name and the range.
+        last. It contains a cycle at each of the numbers, and further cycles in between.
+    - `parameters`: a keyword, `k=(8, 12)`, in place of the name and the range of a parameter
+        without dots in its name.
     - `step`: the longest step, as a fraction of the range and of the magnitudes of the
         states. Default: 0.05.
     - `max_points`: largest number of cycles in each direction. Default: 1000.

@@ -82,8 +82,9 @@ def sweep(
     - `model`: a system, some of whose scalar parameters take the values given (names may have
         dots); or a function of these parameters that returns a system.
     - `values`: values of each parameter by name, of which all combinations are taken; or
-        `hj.scale.SweepPoints`. Without dots in their names, parameters can be given as keywords,
-        too: `hj.sweep(system, k=[9, 10])`. A number is the only value of its parameter.
+        `hj.scale.SweepPoints`. A number is the only value of its parameter.
+    - `parameters`: such values as keywords, `hj.sweep(system, k=[9, 10])`, of parameters without
+        dots in their names.
     - `quantities`: quantities to keep of each cycle: "period", "state" (at its phase origin, with
         the chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
         functions of a `LimitCycle`, kept under their names, that return a number or an array of
