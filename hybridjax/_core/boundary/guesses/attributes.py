@@ -347,6 +347,11 @@ ATTRIBUTES = {
             "efficiency gain factor ratio d_efficiency"
         ),
     },
+    "Flow": {
+        "`jax.jacfwd` of a function that returns `hj.flow(...).state` is its Jacobian": (
+            "jacobian jac monodromy stm gradient grad derivative sensitivity"
+        ),
+    },
     "Event": {
         "`event.before` and `event.after` have the states by name": (
             "states q x y values jump"
