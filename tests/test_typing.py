@@ -45,6 +45,17 @@ hj.optimal_design(model, noise={"yM": 1e-4}, goal=hj.designs.ResponseGoal((0.1, 
 hj.designs.Limits(distortion=hj.designs.Distortion(cycle, phase, {"yM": 1e-5})).distortion
 hj.read_recording("walk.c3d", signals=("LASI.x", "Fz1")).signals
 hj.Recording.beside([recording, recording]).units
+hj.identify_recording("walk.csv", apex, "u", "yM")
+hj.identify_recording({"time": [0.0, 1.0], "y": [0.0, 1.0]}, "strike", "u", "y")
+hj.Recording({"time": [0.0, 1.0], "y": [0.0, 1.0]}).signals
+hj.find_limit_cycle(hopper, (2.0, 1.0, 0.0, 0.0), section="touchdown")
+hj.simulate(hopper, {"yM": 2.0, "vM": 1.0, "ym": 0.0, "vm": 0.0}, 1.0)
+hj.simulate(hopper, duration=1.0)
+hj.find_limit_cycle(lambda t, q: (q[1], -q[0]), (2.0, 0.0)).multipliers
+float(hj.flow(hopper, [2.0, 1.0, 0.0, 0.0], 1.0)["yM"])
+hj.sweep(hopper, k=[9.0, 10.0], b=5.0)
+hj.continuation(cycle, k=(9.0, 11.0)).stable
+hj.linearize(cycle, ["touchdown", apex])
 hj.fitting.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
 """
 
@@ -104,6 +115,7 @@ ALLOWED = {
     "MuJoCoPlant.set_state",
     "PlantCycle.__init__.state",
     "SubjectStudy.__init__.results",
+    "identify_subjects.options",
 }
 
 

@@ -5,9 +5,11 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import inspect
 import itertools
 import json
 import multiprocessing
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from html import escape
@@ -17,8 +19,9 @@ from typing import Any, cast
 from .. import __version__
 from .._core import html
 from .._core.arguments import package
-from .._core.boundary.checked import checked
+from .._core.boundary.checked import WrongArguments, checked
 from .._core.boundary.kinds import FilePath, OptionalNames
+from .._core.boundary.leads import about_keyword
 from .._core.pieces.description import digest_of
 from .._core.pieces.run import DaskClient
 from .._core.precision import enable_x64
@@ -31,9 +34,10 @@ from ..identify.series.fit import SeriesFit
 from ..io import load
 from ..plot.look import AxesLike, Plot, save_and_close
 from ..plot.subjects import forest
+from ..recordings.identification import identify_recording
 from ..recordings.natural import NaturalMultipliers
 from ..recordings.population.population import Population
-from ..recordings.population.tables import factors_of, table_of
+from ..recordings.population.tables import Columns, factors_of, table_of
 from ..recordings.read import read_recording
 from .identify import (
     PAGE,
@@ -179,14 +183,15 @@ def run(options: Any) -> int:
 @checked
 @working("identify_subjects")
 def identify_subjects(
-    table: FilePath,
+    table: FilePath | Columns,
     folder: FilePath,
-    identify: Callable,
+    identify: Callable | None = None,
     *,
     time: str = "time",
     signals: OptionalNames = (),
     formats: tuple[Format, ...] = ("png",),
     client: DaskClient | concurrent.futures.Executor | None = None,
+    **options: Any,
 ) -> SubjectStudy:
     """Identify all subjects of a table, write a report for each, and one for all of them.
 
@@ -202,11 +207,12 @@ def identify_subjects(
 
     - `table`: CSV file with the columns `file` (relative to the table) and `subject`; `condition`
       and `group`, if there are any; other columns (age, speed) are kept in
-      `SubjectStudy.population.table`.
+      `SubjectStudy.population.table`. Or such columns, as a data frame or by name, with files
+      relative to the folder of this process.
     - `folder`: folder of the results, which is made if it does not exist.
-    - `identify`: function from a `Recording` to the result of `identify_recording`, e.g.
-      `functools.partial(hj.identify_recording, sections=..., inputs=..., outputs=...)`; without
-      `inputs`, multipliers are those of variability.
+    - `identify`: function from a `Recording` to the result of `identify_recording`. Default:
+      `identify_recording` itself, with all further keywords, `options`, such as `sections`,
+      `inputs` and `outputs`; without `inputs`, multipliers are those of variability.
     - `time`: name of the column with the times. Default: "time".
     - `signals`: names of the signals to be read. Default: all.
     - `formats`: formats of the figures. Default: PNG.
@@ -224,20 +230,20 @@ def identify_subjects(
     **Example:**
 
     ```python
-    import functools
     recording.to_pandas().to_csv("S1.csv")
     with open("subjects.csv", "w") as table:
         print("file,subject", file=table)
         print("S1.csv,S1", file=table)
-    options = {"sections": apex, "inputs": "u", "outputs": outputs, "n_sections": 8}
-    identify = functools.partial(hj.identify_recording, order=2, **options)
-    study = hj.identify_subjects("subjects.csv", "study", identify, signals=("u", *outputs))
+    options = {"inputs": "u", "outputs": outputs, "n_sections": 8, "order": 2}
+    study = hj.identify_subjects("subjects.csv", "study", sections=apex, **options)
     ```
 
     **Before:** `hj.identify_recording` of one subject. **After:** `study.population.difference`,
     `study.plot(quantity)`.
     """
-    rows = _rows(Path(table))
+    identify = _identify_by(identify, options)
+    rows = _rows(table)
+    place = Path(table).parent if isinstance(table, str | os.PathLike) else Path()
     root = Path(folder)
     jobs: dict[str, Callable[[], str]] = {}
     reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
@@ -246,7 +252,7 @@ def identify_subjects(
             raise DefinitionError(
                 f"two subjects would have the report '{name}': rename one."
             )
-        files = [Path(table).parent / file for file in trials["file"]]
+        files = [place / file for file in trials["file"]]
         jobs[name] = functools.partial(
             _cause, _report, files, root / name, identify, reading, formats
         )
@@ -315,10 +321,59 @@ def _population(frame: Any, root: Path) -> tuple[Population, tuple[SeriesFit, ..
     return Population.from_fits(fits, facts), tuple(fits)
 
 
-def _rows(path: Path) -> Any:
-    """Return the table with the names of reports; columns with numbers in all rows as numbers."""
+def _identify_by(identify: Callable | None, options: Mapping[str, Any]) -> Callable:
+    """Return the function that identifies a recording: that given, or `identify_recording` with the
+    options.
+
+    **Raises:** `DefinitionError` for options beside a function, for those that `identify_recording`
+    has not, and where it gets no sections.
+    """
+    if identify is not None and options:
+        raise DefinitionError(
+            f"`{next(iter(options))}` is for `hj.identify_recording`: pass it inside of "
+            "`identify`, or leave `identify` out."
+        )
+    if identify is not None:
+        return identify
+    known = list(inspect.signature(identify_recording).parameters)[1:]
+    for name in options:
+        if name not in known:
+            raise WrongArguments(about_keyword("identify_subjects", name, known))
+    if "sections" not in options:
+        raise DefinitionError(
+            "identify_subjects needs `sections`, `outputs` and perhaps `inputs`, those of "
+            "`hj.identify_recording`."
+        )
+    return functools.partial(identify_recording, **options)
+
+
+def _rows(table: FilePath | Columns) -> Any:
+    """Return the table with the names of reports; columns with numbers in all rows as numbers.
+
+    **Raises:** `DefinitionError` for a file that cannot be read, and for a table without files or
+    subjects.
+    """
+    if isinstance(table, str | os.PathLike):
+        called = f"the table '{table}'"
+        rows = _read(Path(table))
+    else:
+        called = "`table`"
+        columns = {str(name): list(values) for name, values in table.items()}
+        rows = package("pandas").DataFrame(columns)
+    needed = rows.reindex(columns=["file", "subject"], fill_value="")
+    if rows.empty or not needed.all(axis=None):
+        raise DefinitionError(
+            f"{called} needs 'file' and 'subject' in each row, separated by commas."
+        )
+    rows = table_of(rows, len(rows))
+    names = rows[["subject", *factors_of(rows)]].agg("-".join, axis=1)
+    rows.insert(0, "report", [re.sub(r"[^\w.+-]+", "_", name) for name in names])
+    return rows
+
+
+def _read(path: Path) -> Any:
     try:
-        rows = package("pandas").read_csv(
+        return package("pandas").read_csv(
             path,
             encoding="utf-8-sig",
             dtype=dict.fromkeys(("file", "subject", "group", "condition"), str),
@@ -330,15 +385,6 @@ def _rows(path: Path) -> Any:
         raise DefinitionError(
             f"cannot read '{path}': {getattr(why, 'strerror', why)}."
         ) from None
-    needed = rows.reindex(columns=["file", "subject"], fill_value="")
-    if rows.empty or not needed.all(axis=None):
-        raise DefinitionError(
-            f"the table '{path}' needs 'file' and 'subject' in each row, separated by commas."
-        )
-    rows = table_of(rows, len(rows))
-    names = rows[["subject", *factors_of(rows)]].agg("-".join, axis=1)
-    rows.insert(0, "report", [re.sub(r"[^\w.+-]+", "_", name) for name in names])
-    return rows
 
 
 def _write(

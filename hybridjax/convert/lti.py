@@ -15,6 +15,7 @@ from jaxtyping import Complex
 from .._core.arguments import package
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Positive, SignalNames
+from .._core.boundary.members import leading_on
 from .._core.executor import is_traced
 from .._core.precision import require_x64
 from .._core.signal import Signal, unit_of
@@ -143,6 +144,7 @@ def to_control(thing: LDTP | HTF, *, period: Positive = 1.0) -> Any:
     )
 
 
+@leading_on
 class HarmonicStateSpace(NamedTuple):
     """Constant matrices of the harmonics of states, inputs and outputs in dX/dt = A X + B U and
     Y = C X + D U, harmonic -order first, to order. Block (m, n) of B is that from U_n to X_m."""

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, host_first
 from .._core.executor import is_traced, namespace
@@ -28,6 +29,7 @@ from .._core.text import folded, number, signal_values
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system, evaluating
 from ..systems.quotient import check_symmetry
+from ..systems.start import StateLike, SystemLike, guess_of, own_guess, system_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem, name_of
 from ..systems.transition import SAME_TIME, Scheduled
@@ -50,6 +52,7 @@ _SAME = 1e-9
 _MOMENT = 1e-6
 
 
+@leading_on
 class Event(NamedTuple):
     """One event of a trajectory."""
 
@@ -169,14 +172,17 @@ class Trajectory(Showable, eqx.Module):
         return t, chart, state
 
     def at(
-        self, t: Annotated[Numbers, Reals("p")]
-    ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, "p d"]]:
-        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At an
-        event they are those after it.
+        self, t: Annotated[Numbers, Reals("p")] | Scalar
+    ) -> tuple[Int[np.ndarray, "*p"], Float[np.ndarray, "*p d"]]:
+        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At one
+        time they are without that axis; at an event they are those after it.
 
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """
         t = np.asarray(t)
+        if not t.ndim:
+            charts, single = self.at(t[None])
+            return charts[0], single[0]
         begin = self.t[0]
         end = self.t[-1]
         if len(t) and not begin <= t.min() <= t.max() <= end:
@@ -295,8 +301,8 @@ def observed(
 
 @checked
 def simulate(
-    system: HybridSystem,
-    chart: str | Guess,
+    system: SystemLike,
+    chart: str | Guess | StateLike | None = None,
     state: Annotated[Numbers, Reals()] | None = None,
     duration: Duration | None = None,
     *,
@@ -310,11 +316,13 @@ def simulate(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`.
+    - `system`: a `HybridSystem`; with a state, a field (t, q) of one chart without events stands
+        for it.
     - `chart`, `state`, `time`: the start, given by the name of a chart, its states (n,) in order,
         and the time (Default: 0). A guard that is zero or negative there is not an event: a ball
         that starts below the floor falls on. `findings` of the trajectory list such guards. A
-        `Guess` stands for all three: `hj.simulate(system, guess, duration)`.
+        `Guess` stands for all three, `hj.simulate(system, guess, duration)`, and so does a state,
+        in order or by name, where only one chart has such states. Default: the model's own guess.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -342,13 +350,14 @@ def simulate(
     """
     require_x64(system, settings)
     settings = Settings() if settings is None else settings
+    system = system_of(system, state if chart is None else chart)
     system = settings.system(system)
     check_system(system)
     check_symmetry(system)
     constant = constant_input(system, input)
     s = Structure(current(Driven(system, input)) if callable(input) else system)
     check_schedules(s)
-    start, length = _start_of(chart, state, duration, time)
+    start, length = _start_of(s, chart, state, duration, time)
     begin = lane_at(s, start.chart, start.state, start.time, "`state`")
     settings = settings.filled(SIMULATION)
     target = until(begin.t + float(length))
@@ -404,23 +413,33 @@ def integrate(
 
 
 def _start_of(
-    chart: str | Guess, state: Any, duration: Any, time: Any
+    s: Structure,
+    chart: str | Guess | StateLike | None,
+    state: Any,
+    duration: Any,
+    time: Any,
 ) -> tuple[Guess, Any]:
-    """Return the start and the duration, from a chart with a state, or from a guess.
+    """Return the start and the duration, from a chart with a state, from a guess, or from a state
+    of the only chart that it fits.
 
     **Raises:** `DefinitionError` where one of them is missing.
     """
+    if chart is None and duration is not None:
+        chart = own_guess(s.system) if state is None else state
+        state = None
+    if chart is not None and not isinstance(chart, str | Guess):
+        chart = guess_of(s, chart, "the state", time)
     if isinstance(chart, Guess):
         # (The duration takes the place of the state.)
         length = state if duration is None else duration
         if length is None or np.ndim(length) or not length > 0:
             raise DefinitionError(
-                "simulate: after a guess, give the duration, a positive number: "
+                "simulate: after a guess or a state, give the duration, a positive number: "
                 "`hj.simulate(system, guess, duration)`."
             )
         return chart, length
-    if state is None or duration is None:
-        missing = "state" if state is None else "duration"
+    if chart is None or state is None or duration is None:
+        missing = "state" if state is None and chart is not None else "duration"
         raise DefinitionError(
             f"simulate needs `{missing}`: `hj.simulate(system, chart, state, duration)`, or "
             "`hj.simulate(system, guess, duration)`."

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Numbers
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.executor import is_traced
 from .._core.meaning import require_as_made
@@ -53,6 +54,7 @@ from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 _STEPS = 32
 
 
+@leading_on
 class Response(NamedTuple):
     """The response of S experiments of n samples."""
 

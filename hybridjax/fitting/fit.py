@@ -30,6 +30,7 @@ from ..orbits.find import find_limit_cycle
 from ..orbits.guess import require_similar
 from ..systems.check import check_system
 from ..systems.quotient import check_symmetry
+from ..systems.start import StateLike
 from ..systems.system import Guess, HybridSystem
 from .beside import Model
 from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
@@ -75,7 +76,7 @@ def fit_model(
     data: Data,
     free: Free,
     *,
-    guess: Guess | LimitCycle | None = None,
+    guess: Guess | LimitCycle | StateLike | None = None,
     guesses: Count = 1,
     seed: Seed = 0,
 ) -> ModelFit:
@@ -215,7 +216,7 @@ def identifiability(
     data: Data,
     free: Free,
     *,
-    guess: Guess | LimitCycle | None = None,
+    guess: Guess | LimitCycle | StateLike | None = None,
 ) -> Identifiability:
     """Find the combinations of parameters that data identify, without a fit.
 
@@ -254,7 +255,10 @@ def identifiability(
 
 
 def _prepare(
-    system: HybridSystem, data: Data, free: Free, guess: Guess | LimitCycle | None
+    system: HybridSystem,
+    data: Data,
+    free: Free,
+    guess: Guess | LimitCycle | StateLike | None,
 ) -> tuple[FitProblem, LimitCycle]:
     """Return the problem, and a limit cycle near which to search for others."""
     observations = [data] if isinstance(data, AbstractObservation) else data
@@ -297,7 +301,9 @@ def _require_same_weighting(observations: Sequence[AbstractObservation]) -> None
         raise DefinitionError("give standard deviations of all data, or of none.")
 
 
-def _known_cycle(system: HybridSystem, guess: Guess | LimitCycle | None) -> LimitCycle:
+def _known_cycle(
+    system: HybridSystem, guess: Guess | LimitCycle | StateLike | None
+) -> LimitCycle:
     """The cycle near which others are searched for. Fits of the same system from no guess, as of
     many draws of data, share it, and what is recorded of it."""
     if guess is None:

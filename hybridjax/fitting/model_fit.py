@@ -18,6 +18,7 @@ from jaxtyping import Complex, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Probability
+from .._core.boundary.members import leading_on
 from .._core.findings import Finding
 from .._core.html import table, text
 from .._core.results import Result
@@ -149,6 +150,7 @@ def _describe(names: tuple[str, ...], row: Float[np.ndarray, " p"]) -> str:
     return f"a common factor, with these powers, of ({powers})"
 
 
+@leading_on
 class ParameterGuess(NamedTuple):
     """A guess of a fit, and its result."""
 

@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, cast
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex
 
 from .._core.arguments import Numbers
 from .._core.boundary.checked import checked
@@ -18,7 +17,6 @@ from .._core.boundary.kinds import Order, Seed
 from .._core.boundary.values import Reals
 from .._core.findings import Finding
 from .._core.progress import say, working
-from .._core.showable import WithMultipliers
 from ..engine.trajectory import observed
 from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
@@ -36,7 +34,7 @@ from ..sections.place import as_placed
 from ..sections.placed import SectionsLike
 from ..systems.system import HybridSystem, OutputNames
 from .htf_estimate import estimate_htf
-from .multiplier_estimate import MultiplierComparison
+from .multiplier_estimate import MultiplierComparison, OfMultiplierFit
 from .multipliers import StructuredFit, fit_multipliers
 
 
@@ -52,12 +50,13 @@ _PERIODS = 16
 _REALIZATIONS = 4
 
 
-class ModelIdentification(WithMultipliers, eqx.Module):
+class ModelIdentification(OfMultiplierFit, eqx.Module):
     """The results of `identify_model`, step by step.
 
     **Fields:** `cycle`; `model`, the exact linearization; `design`, `data` of its experiments,
     `htf`, estimated from them, and `fit`, whose multipliers `comparison` compares with the exact
-    ones. Functions that take a fit, data or an HTF take it, too.
+    ones. It has `multipliers`, `modulus`, `standard_errors`, `interval`, `contains` and `compare`
+    of the fit. Functions that take a fit, data or an HTF take it, too.
     """
 
     cycle: LimitCycle
@@ -68,11 +67,6 @@ class ModelIdentification(WithMultipliers, eqx.Module):
     fit: StructuredFit
 
     _stands_for: ClassVar = ("fit", "data", "htf")
-
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " d"]:
-        """The estimated multipliers."""
-        return self.fit.multipliers
 
     @property
     def comparison(self) -> MultiplierComparison:

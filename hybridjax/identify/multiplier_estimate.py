@@ -11,7 +11,7 @@ findings about the number of multipliers (`order_doubts`, `left_out`).
 import dataclasses
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import numpy as np
@@ -30,7 +30,7 @@ from ..errors import DefinitionError
 from ..linear.multipliers import largest_first
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients, positive
-from .fit import Fit
+from .fit import Fit, OfFit
 
 
 # Level of the test whether a fit needs one more multiplier. Larger: with process noise, whose
@@ -144,6 +144,47 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     return MultiplierComparison(
         paired_truth[order], paired_values[order], with_fit=with_fit
     )
+
+
+class OfMultiplierFit(OfFit):
+    """A result of several steps whose `fit` compares its multipliers with others."""
+
+    if TYPE_CHECKING:
+
+        @property
+        def fit(self) -> "MultiplierFit": ...
+
+    @checked
+    def contains(
+        self, true: Truth, level: Probability = 0.95
+    ) -> Bool[np.ndarray, " k"]:
+        """Test whether supposed multipliers lie in the confidence region of this level, as
+        `result.fit.contains` does.
+
+        **Arguments:** `true`: multipliers, or a cycle, a model or a fit that has them.
+
+        **Example:**
+
+        ```python
+        print(result.contains(cycle))
+        ```
+        """
+        return self.fit.contains(true, level)
+
+    @checked
+    def compare(self, other: Truth) -> MultiplierComparison:
+        """Pair the multipliers with true ones, or with those of another fit, as
+        `result.fit.compare` does.
+
+        **Arguments:** `other`: multipliers, or a cycle, a model or a fit that has them.
+
+        **Example:**
+
+        ```python
+        print(result.compare(cycle))
+        ```
+        """
+        return self.fit.compare(other)
 
 
 class MultiplierFit(Fit):

@@ -11,16 +11,17 @@ Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 1
 """
 
 import dataclasses
-from typing import Annotated, Any, Literal, NamedTuple, SupportsIndex, get_args
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, SupportsIndex, get_args
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from .._core.boundary.checked import checked, checked_methods
-from .._core.boundary.kinds import Count, Numbers, Share
-from .._core.boundary.values import Reals
+from .._core.boundary.checked import checked, checked_methods, taken_parameters
+from .._core.boundary.kinds import Count, Share, Vector
+from .._core.boundary.members import leading_on
 from .._core.html import COLORS, Curve as Line, card, picture, table
 from .._core.memo import remembered
 from .._core.precision import require_x64
@@ -29,7 +30,7 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import Guess, copies_of, require_positive
+from ..systems.system import Guess, copies_of, parameters_of, require_positive
 from .batches import front
 from .branch_ends import explained
 from .coincidence import SAME
@@ -59,6 +60,7 @@ Kind = Literal["fold", "branch point", "flip", "Neimark-Sacker"]
 KINDS: tuple[str, ...] = get_args(Kind)
 
 
+@leading_on
 class BranchPoint(NamedTuple):
     """A point of a branch with a multiplier on the unit circle."""
 
@@ -79,6 +81,7 @@ class BranchPoint(NamedTuple):
         return self.multipliers[off_circle < SAME]
 
 
+@leading_on
 class BranchEnd(NamedTuple):
     """The end of a branch, and the reason."""
 
@@ -189,11 +192,12 @@ class Branch(Showable, eqx.Module):
 @working("continuation")
 def continuation(
     cycle: LimitCycle,
-    parameter: str,
-    range: Annotated[Numbers, Reals("n")],
+    parameter: str | None = None,
+    range: Vector | None = None,
     *,
     step: Share = 0.05,
     max_points: Count = 1000,
+    **parameters: Vector,
 ) -> Branch:
     """Continue a limit cycle in a parameter, and mark changes of its stability.
 
@@ -209,6 +213,8 @@ def continuation(
         as `"leg.k"`.
     - `range`: two or more numbers, ascending or descending. The branch ends at the first and the
         last. It contains a cycle at each of the numbers, and further cycles in between.
+    - `parameters`: a keyword, `k=(8, 12)`, in place of the name and the range of a parameter
+        without dots in its name.
     - `step`: the longest step, as a fraction of the range and of the magnitudes of the
         states. Default: 0.05.
     - `max_points`: largest number of cycles in each direction. Default: 1000.
@@ -223,12 +229,13 @@ def continuation(
     **Example:**
 
     ```python
-    branch = hj.continuation(cycle, "k", (10.0, 11.0), step=0.5)
+    branch = hj.continuation(cycle, k=(10.0, 11.0), step=0.5)
     print(branch.values, branch.stable)
     ```
 
     **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `branch.to_pandas()`.
     """
+    parameter, range = _parameter_and_range(cycle, parameter, range, parameters)
     values = _check(cycle, range)
     cycle = _at_event(cycle)
     curve = Curve(cycle, parameter, float(np.ptp(values)))
@@ -256,6 +263,34 @@ def continuation(
     ahead, end = trace.run(first.oriented(sense))
     points = [*back[:0:-1], *ahead]
     return _branch(curve, points, len(back) - 1, (begin, end))
+
+
+def _parameter_and_range(
+    cycle: LimitCycle,
+    parameter: str | None,
+    range: Any,
+    by_name: Mapping[str, Any],
+) -> tuple[str, Any]:
+    """Return the name of the parameter, and its range.
+
+    **Raises:** `DefinitionError` where one of them is missing, or there are several.
+    """
+    given = list(taken_parameters(continuation, cycle, by_name).items())
+    if parameter is not None and range is not None:
+        given.append((parameter, range))
+    if len(given) > 1:
+        names = " and ".join(f"`{name}`" for name, _ in given)
+        raise DefinitionError(
+            f"a continuation has one parameter, not {names}: `hj.sweep` takes several."
+        )
+    if not given or (parameter is not None and range is None):
+        names = parameters_of(cycle.system)
+        name = parameter or next((x for x in names if "." not in x), "k")
+        raise DefinitionError(
+            "continuation needs a parameter and its `range`, with the value of the cycle's "
+            f"system between them, as in `hj.continuation(cycle, '{name}', (0.1, 0.5))`."
+        )
+    return given[0]
 
 
 def _at_event(cycle: LimitCycle) -> LimitCycle:

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from .._core.boundary.members import leading_on
 from .._core.compilation import host_first
 from .._core.executor import to_host
 from .._core.results import Result
@@ -46,6 +47,7 @@ SAME = 1e-6
 _MOST_ORDERED = 6
 
 
+@leading_on
 class SimultaneousEvents(NamedTuple):
     """Events of a cycle that happen at the same time."""
 

@@ -9,7 +9,7 @@ that falls through zero at the section: if a section is crossed in the wrong dir
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Scalar, SignalNames
+from .._core.boundary.values import Plain
 from .._core.executor import Definition, namespace
 from .._core.precision import real
 from .._core.text import fields
@@ -141,6 +142,18 @@ class AtEvent(eqx.Module):
     def check(self, s: Structure) -> None:
         """**Raises:** `DefinitionError` for an event that the system does not have."""
         s.transition_index(self.name)
+
+
+EventName = Annotated[
+    str, Plain("the name of an event", lambda value: isinstance(value, str))
+]
+SectionLike: TypeAlias = Crossing | AtEvent | EventName
+"""A single section; an event also by its name."""
+
+
+def as_section(section: SectionLike) -> Crossing | AtEvent:
+    """Return a section: of a name, that right after the event."""
+    return AtEvent(section) if isinstance(section, str) else section
 
 
 class ListLevels(AbstractLevels):

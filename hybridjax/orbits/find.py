@@ -35,11 +35,12 @@ from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
 from ..systems.quotient import check_symmetry
 from ..systems.solver import Radau
+from ..systems.start import StateLike, SystemLike, guess_of, system_of
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
 from .coincidence import SAME, check_begin, commutes
-from .crossing import AtEvent, Crossing
+from .crossing import AtEvent, Crossing, SectionLike, as_section
 from .curve import away_from_events
 from .cycle import LimitCycle, derived_if_found
 from .guess import (
@@ -106,10 +107,10 @@ _DISTANT = 1e3
 @working("find_limit_cycle")
 @uncollected()
 def find_limit_cycle(
-    system: HybridSystem,
-    guess: Guess | LimitCycle | None = None,
+    system: SystemLike,
+    guess: Guess | LimitCycle | StateLike | None = None,
     *,
-    section: Crossing | AtEvent | None = None,
+    section: SectionLike | None = None,
     multiplicity: Count | None = None,
     conserved: Mapping[str, Scalar] | None = None,
     settle: Wait = 0.0,
@@ -130,14 +131,16 @@ def find_limit_cycle(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`: one of `hj.models`, or your own.
+    - `system`: a `HybridSystem`: one of `hj.models`, or your own. With a state as `guess`, a field
+        (t, q) of one chart without events stands for it (`hj.HybridSystem.from_functions`).
     - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
+        A state, in order or by name, stands for a `Guess` where only one chart has such states.
         With a cycle, leave out `settle` and `max_period`; the search begins at the same phase of
         the clock as that cycle, or, if an event has passed this phase, far from events. Default:
         the model's own guess.
     - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
-        "falling")` or `AtEvent("heelstrike")`. Newton's method starts at the guess if it lies on
-        the section, else where the flow from the guess first crosses it. Default: the section right
+        "falling")`, or the name of an event. Newton's method starts at the guess if it lies on the
+        section, else where the flow from the guess first crosses it. Default: the section right
         after the event that the guess names (`Guess(..., after="heelstrike")`), or else the plane
         through the guess that is orthogonal to the flow (in scaled states). If the flow does not
         return to this plane, such a plane through a later state is taken.
@@ -189,6 +192,10 @@ def find_limit_cycle(
     `hj.run_experiments`, `hj.continuation`, `hj.plot.cycle`.
     """
     settings = Settings() if settings is None else settings
+    system = system_of(system, guess)
+    section = None if section is None else as_section(section)
+    if not isinstance(guess, Guess | LimitCycle | None):
+        guess = guess_of(Structure(system), guess, "`guess`")
     if settings.solver == "auto":
         explicit = dataclasses.replace(settings, solver=None)
         first: dict[str, Any] = dict(settle=settle, max_period=max_period)

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .._core.arguments import require_among
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
 from .._core.compilation import Program, quick_jit
-from .._core.executor import Array, is_traced, namespace
+from .._core.executor import Array, is_traced, namespace, to_host
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
@@ -44,12 +45,14 @@ from ..engine.trajectory import (
 from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_schedules, check_system
 from ..systems.quotient import check_symmetry
+from ..systems.start import StateLike, SystemLike, guess_of, system_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem, name_of
 from ..systems.transition import SAME_TIME
 from . import rivals
 from .coincidence import all_commute, groups_on
 from .crossing import AtEvent, Crossing, to_section
+from .cycle import LimitCycle
 
 
 # Error of a step relative to the sizes of states. Larger: derivatives, which are those of the
@@ -88,11 +91,12 @@ class Flow(Showable, eqx.Module):
     right after an event. All numbers of a flow that failed are NaN, and so are those of events that
     did not happen.
 
-    **Fields:** `t`, `state`, `chart`: time, state (n,) and index of the chart at the end. `result`:
-    a `Result` code. `event_times` (E,), `event_index` (E,): times of the first E events, and
-    indices of their transitions (-1 for none). `before`, `after` (E, d): the states before and
-    after their resets. `count`: number of all events. `trajectory`: steps and dense states, of a
-    single flow that JAX does not trace; otherwise None. `findings`: doubts about its start and end.
+    **Fields:** `t`, `state`, `chart`: time, state (n,) and index of the chart at the end;
+    `flow["y"]` is a state by its name. `result`: a `Result` code. `event_times` (E,), `event_index`
+    (E,): times of the first E events, and indices of their transitions (-1 for none). `before`,
+    `after` (E, d): the states before and after their resets. `count`: number of all events.
+    `trajectory`: steps and dense states, of a single flow that JAX does not trace; otherwise None.
+    `findings`: doubts about its start and end.
     """
 
     t: Float[Array, "*L"]
@@ -134,6 +138,25 @@ class Flow(Showable, eqx.Module):
             )
         return self.trajectory
 
+    def __getitem__(self, name: str) -> Float[Array, "*L"]:
+        """A state at the end by its name, `flow["yM"]`, differentiable as `state` is; NaN in charts
+        without it.
+
+        **Raises:** `DefinitionError` for a state that no chart has.
+        """
+        s = self.structure
+        require_among("state", [name], s.state_names())
+        index = [
+            chart.states.index(name) if name in chart.states else -1
+            for chart in s.charts
+        ]
+        xp = namespace(self.state)
+        places = xp.asarray(index)[self.chart]
+        values = xp.take_along_axis(
+            self.state, xp.maximum(places, 0)[..., None], axis=-1
+        )[..., 0]
+        return xp.where(places < 0, np.nan, values)
+
     @property
     def system(self) -> HybridSystem:
         return self.structure.system
@@ -144,20 +167,24 @@ class Flow(Showable, eqx.Module):
         return namespace(self.result).atleast_1d(self.result)
 
     def at(
-        self, times: Annotated[Numbers, Reals("K")]
-    ) -> tuple[Int[Array, "*L K"], Float[Array, "*L K d"]]:
+        self, times: Annotated[Numbers, Reals("K")] | Scalar
+    ) -> tuple[Int[Array, "*LK"], Float[Array, "*LK d"]]:
         """Charts and states, padded to d numbers, at some times, as accurate as the flow itself and
         differentiable like it. They are NaN at times before its start and after its end, and at all
         times if events coincide whose order matters.
 
-        **Arguments:** `times` (K,).
+        **Arguments:** `times` (K,), or one.
 
-        **Returns:** `charts` (K,), their indices, and `states` (K, d).
+        **Returns:** `charts` (K,), their indices, and `states` (K, d); at one time without that
+        axis.
 
         **Raises:** `DefinitionError` if the system's code has changed since.
         """
         require_x64(self)
         require_as_made(self.system, "this flow was computed")
+        if not np.ndim(times):
+            charts, states = self.at(namespace(times).asarray(times)[None])
+            return charts[..., 0], states[..., 0, :]
         if self.trajectory is not None and not is_traced(times):
             return self._on_steps(np.asarray(times))
         samples = _program(self.request, jnp.asarray(times)).samples
@@ -216,8 +243,8 @@ class _Request(eqx.Module):
 
 @checked
 def flow(
-    system: HybridSystem,
-    start: Guess | Flow,
+    system: SystemLike,
+    start: Guess | Flow | LimitCycle | StateLike,
     until: Scalar | str | AtEvent | Crossing | None = None,
     *,
     events: Count | None = None,
@@ -238,9 +265,12 @@ def flow(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`.
+    - `system`: a `HybridSystem`; with a state, a field (t, q) of one chart without events stands
+      for it.
     - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
-      that ended there. A `Guess` with states (L, n) starts L flows.
+      that ended there. A `Guess` with states (L, n) starts L flows. A state (n,), in order or by
+      name, stands for a `Guess` where only one chart has such states, and a `LimitCycle` for its
+      state at `anchor`.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
     - `within`: the longest duration, required for all ends other than a time. Do not make it much
@@ -254,8 +284,9 @@ def flow(
     - `throw`: raise an error if the flow ends early. Default: True. With False, and inside of JAX's
       transformations, `result` has the reason, and times and states are NaN.
 
-    **Returns:** a `Flow`: `t`, `state` and `chart` at the end; `event_times`, `event_index`,
-    `before` and `after` of the first `max_events` events; `result`; and `at(times)`.
+    **Returns:** a `Flow`: `t`, `state` and `chart` at the end, `flow["y"]`; `event_times`,
+    `event_index`, `before` and `after` of the first `max_events` events; `result`; and
+    `at(times)`.
 
     **Raises:** `DefinitionError` for bad arguments; `ComputationError` if the end is not reached,
     for grazing, Zeno, blow-up and the limit on steps, if `throw`.
@@ -265,12 +296,12 @@ def flow(
     ```python
     start = hj.Guess("flight", (2.0, 1.0, 0.0, 0.0))
     landing = hj.flow(hopper, start, "touchdown", within=5.0)
-    print(landing.t, landing.state)
+    print(landing.t, landing["yM"])
 
     import jax
 
     def height(k):
-        return hj.flow(hopper.replace(k=k), start, 3.0).state[0]
+        return hj.flow(hopper.replace(k=k), start, 3.0)["yM"]
 
     print(jax.grad(height)(10.0))
     ```
@@ -290,8 +321,8 @@ def flow(
 
 
 def requested(
-    system: HybridSystem,
-    start: Guess | Flow,
+    system: SystemLike,
+    start: Guess | Flow | LimitCycle | StateLike,
     until: Any,
     events: int | None,
     within: Any,
@@ -306,7 +337,8 @@ def requested(
     """
     require_x64(system, start, settings)
     settings = Settings() if settings is None else settings
-    system = settings.system(system)
+    begin = None if isinstance(start, Flow | LimitCycle) else start
+    system = settings.system(system_of(system, begin))
     settings = settings.filled(_ACCURACY)
     if max_steps is None:
         max_steps = max(MOST_STEPS, settings.max_steps)
@@ -324,6 +356,10 @@ def requested(
         system = current(Driven(system, drive))
     s = Structure(system)
     check_schedules(s)
+    if isinstance(start, LimitCycle):
+        start = _at_anchor(start)
+    elif not isinstance(start, Guess | Flow):
+        start = guess_of(s, start, "`start`")
     if isinstance(start, Flow):
         _require_start(start, s)
         lanes = start.lanes
@@ -362,6 +398,14 @@ def _require_start(start: Flow, s: Structure) -> None:
             f"the flow that ended at `start` failed ({Result(int(start.result)).message}): nothing "
             "can go on from there."
         )
+
+
+def _at_anchor(cycle: LimitCycle) -> Guess:
+    """The state of a limit cycle where it begins."""
+    state = tuple(cycle.state.values())
+    anchor = to_host(cycle.anchor)
+    name = cycle.structure.names[int(anchor.chart[0])]
+    return Guess(name, state, anchor.t[0])
 
 
 def _lanes_of(s: Structure, start: Guess) -> tuple[Lanes, bool]:

@@ -31,6 +31,7 @@ from ..engine.target import Target, toward, until
 from ..engine.trajectory import begins_beyond
 from ..engine.watch import slopes
 from ..errors import ComputationError, DefinitionError
+from ..systems.start import own_guess
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
 from .checks import check_claims
@@ -94,7 +95,7 @@ def return_map_near(
     **Raises:** `DefinitionError` for a guess that does not fit the system; `ComputationError` if
     the flow does not lead from it to the section and back, or nothing moves.
     """
-    guess = _own_guess(s.system) if guess is None else guess
+    guess = own_guess(s.system) if guess is None else guess
     lane = lane_at(s, guess.chart, guess.state, guess.time, "the guess")
     _check_event_before(s, guess)
     _check_field(s, guess, lane)
@@ -118,24 +119,6 @@ def return_map_near(
         base = AtEvent(guess.after)
     is_after = section is None and not settle
     return _on_section(map, base, is_after, near.time, max_period)
-
-
-def _own_guess(system: HybridSystem) -> Guess:
-    """The guess of the model.
-
-    **Raises:** `DefinitionError` if it has none.
-    """
-
-    def of_host(x):
-        # (By NumPy: JAX would compile a program for each operation.)
-        return np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x
-
-    guess = jax.tree_util.tree_map(of_host, system).guess()
-    if guess is None:
-        raise DefinitionError(
-            f"{type(system).__name__} has no guess: pass `Guess(chart, state)`."
-        )
-    return guess
 
 
 def _check_event_before(s: Structure, guess: Guess) -> None:

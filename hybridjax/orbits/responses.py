@@ -24,6 +24,7 @@ from jaxtyping import Complex, Float, Inexact
 from .._core.arguments import require_among, require_index
 from .._core.boundary.checked import checked_methods
 from .._core.boundary.kinds import Count, Index, Numbers
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.compilation import at_ease, one_program
 from .._core.executor import (
@@ -83,6 +84,7 @@ class PhaseCurve(Showable, eqx.Module):
         return f"cycles / ({unit} {time})" if unit else f"cycles / {time} / input"
 
 
+@leading_on
 class Impulse(NamedTuple):
     """The response to an input that acts at an event, through a guard or a reset: the value of the
     input at the event, times `weight`, changes the phase or the amplitude."""
@@ -93,6 +95,7 @@ class Impulse(NamedTuple):
     """Change per unit of each input, by name of the input."""
 
 
+@leading_on
 class Locked(NamedTuple):
     """A state in which phases move together: `lead` of the push, in cycles, and the `rate` at which
     deviations grow, per time and strength of the push; negative where it is stable."""

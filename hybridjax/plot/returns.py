@@ -10,7 +10,7 @@ from .._core.boundary.checked import checked
 from .._core.boundary.values import Whole
 from .._core.signal import unit_of, with_unit
 from ..errors import DefinitionError
-from ..orbits.crossing import AtEvent, Crossing
+from ..orbits.crossing import AtEvent, Crossing, SectionLike, as_section
 from ..orbits.cycle import LimitCycle
 from ..sections.families import ClockPhase
 from ..sections.maps import SectionMap, arrivals, section_map
@@ -45,7 +45,7 @@ def return_map(
     cycle: LimitCycle,
     coordinate: str | None = None,
     *,
-    section: Crossing | AtEvent | None = None,
+    section: SectionLike | None = None,
     range: tuple[float, float] | None = None,
     start: float | None = None,
     iterates: Annotated[int, Whole(1, 1000)] = 10,
@@ -64,8 +64,9 @@ def return_map(
     - `cycle`: result of `hj.find_limit_cycle`.
     - `coordinate`: the name of a state. Default: the one that changes most along the line, relative
       to its largest value on the cycle.
-    - `section`: where the coordinate is taken, a `Crossing` or `AtEvent` that the cycle meets once
-      a period. Default: the section of the search, or the phase of the clock at the anchor.
+    - `section`: where the coordinate is taken, a `Crossing` or the name of an event that the cycle
+      meets once a period. Default: the section of the search, or the phase of the clock at the
+      anchor.
     - `range`: the lowest and the highest value that are drawn, (low, high), in the coordinate's
       unit. Default: a fifth of its largest value on the cycle to both sides.
     - `start`: the first value of the cobweb. Default: near the upper end of the range.
@@ -121,11 +122,11 @@ def return_map(
 
 
 def _section(
-    cycle: LimitCycle, section: Crossing | AtEvent | None
+    cycle: LimitCycle, section: SectionLike | None
 ) -> ClockPhase | list[Crossing | AtEvent]:
     """Return the section on which the map is drawn."""
     if section is not None:
-        return [section]
+        return [as_section(section)]
     if cycle.base is not None:
         return [cycle.base]
     phase = float(cycle.anchor.t[0]) / float(cycle.period)

@@ -16,12 +16,12 @@ from ..errors import FileFormatError
 from ..experiments.design.tables import BY_PHASE
 from .formats.columns import Wanted
 from .phase import Phase
-from .read import read_tables
+from .read import RecordingLike, as_recording, read_tables
 from .recording import Recording
 
 
 @checked
-def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recording:
+def attach_design(recording: RecordingLike, phase: Phase, path: FilePath) -> Recording:
     """Add the commanded inputs of hardware to a recording in which they were not measured.
 
     Experiment s was applied in trial s, from the first whole cycle on, and each value held from its
@@ -29,7 +29,8 @@ def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recordi
 
     **Arguments:**
 
-    - `recording`: the recording, one trial per experiment, in the order of the table.
+    - `recording`: the recording, one trial per experiment, in the order of the table; or the path
+      of its file, or a table (`hj.Recording.from_frame`).
     - `phase`: result of `estimate_phase` for this recording.
     - `path`: a table by phase that `Design.write` wrote.
 
@@ -52,6 +53,7 @@ def attach_design(recording: Recording, phase: Phase, path: FilePath) -> Recordi
     **Before:** `design.write`, `hj.recordings.estimate_phase`. **After:**
     `hj.recordings.sample_sections`.
     """
+    recording = as_recording(recording)
     columns = read_tables(Path(path), Wanted("time"))[0].values
     if not set(BY_PHASE) <= set(columns):
         raise FileFormatError(

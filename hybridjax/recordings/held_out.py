@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Order
+from .._core.boundary.members import leading_on
 from ..errors import DefinitionError
 from ..experiments.record import HasRecords, SectionSeries, uninterrupted_records
 from ..identify.denominator import Covariance
@@ -36,6 +37,7 @@ _SHORTEST_END = 12
 _AS_GOOD = 0.02
 
 
+@leading_on
 class HeldOut(NamedTuple):
     """A fit to the first part of each record, tried on the last."""
 
@@ -46,6 +48,7 @@ class HeldOut(NamedTuple):
         return f"{self.fit}\n{self.validation}"
 
 
+@leading_on
 class HeldOutOrders(NamedTuple):
     """How well fits of each order predict held-out cycles. Printing it shows a table.
 

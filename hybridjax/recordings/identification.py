@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import equinox as eqx
-import numpy as np
-from jaxtyping import Complex
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import (
@@ -29,9 +27,10 @@ from .._core.boundary.kinds import (
 from .._core.findings import Finding, print_findings, refuse, warn_of
 from .._core.precision import require_x64
 from .._core.progress import say, working
-from .._core.showable import WithMultipliers
 from .._core.text import listed
 from ..errors import DefinitionError
+from ..identify.fit import OfFit
+from ..identify.multiplier_estimate import OfMultiplierFit
 from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
 from ..identify.series.records import SLOW, PreparedRecords
@@ -45,6 +44,7 @@ from .inspection.inspect import check_recording, inspect_cycles
 from .natural import NaturalMultipliers, natural_multipliers
 from .phase import Phase
 from .phase_estimation import PhaseDefinition, estimate_phase, signals_of
+from .read import RecordingLike, as_recording
 from .recording import Recording
 from .sampling import DriftCycles, sample_sections, without_drift
 from .smoothing import Bandwidth
@@ -65,7 +65,7 @@ MEANING = (
 _MOST_NATURAL = 4
 
 
-class Identification(WithMultipliers, eqx.Module):
+class Identification(OfMultiplierFit, eqx.Module):
     """The results of `identify_recording`, step by step.
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `findings`
@@ -73,7 +73,8 @@ class Identification(WithMultipliers, eqx.Module):
     first three quarters, tried on the last; `responses` to pushes; `curve`, the phase response
     curve of events alone under one input (else None); `diagnosis`.
 
-    Functions that take a fit or data take it, too.
+    It has `multipliers`, `modulus`, `standard_errors`, `interval`, `contains` and `compare` of the
+    fit. Functions that take a fit or data take it, too.
     """
 
     _stands_for: ClassVar = ("fit", "data")
@@ -111,11 +112,6 @@ class Identification(WithMultipliers, eqx.Module):
         report = importlib.import_module("hybridjax.apps.identify")
         return report.write_report(folder, self, formats)
 
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " d"]:
-        """Those of the fit."""
-        return self.fit.multipliers
-
     def __repr__(self) -> str:
         meaning = [textwrap.fill(text, 100) for text in MEANING]
         results = [
@@ -129,13 +125,14 @@ class Identification(WithMultipliers, eqx.Module):
         return "\n".join(results)
 
 
-class NaturalIdentification(WithMultipliers, eqx.Module):
+class NaturalIdentification(OfFit, eqx.Module):
     """The results of `identify_recording` without inputs, step by step.
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `phase`; `data`,
     at the sections; `fit`, the `NaturalMultipliers`; `findings` of all steps.
 
-    Functions that take such data take it, too.
+    It has `multipliers`, `modulus`, `standard_errors` and `interval` of the fit. Functions that
+    take such data take it, too.
     """
 
     _stands_for: ClassVar = ("fit", "data")
@@ -158,11 +155,6 @@ class NaturalIdentification(WithMultipliers, eqx.Module):
         report = importlib.import_module("hybridjax.apps.identify")
         return report.write_report(folder, self, formats)
 
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " d"]:
-        """Those of the fit."""
-        return self.fit.multipliers
-
     def __repr__(self) -> str:
         findings = [x for x in self.findings if x not in self.fit.findings]
         results = [
@@ -178,7 +170,7 @@ class NaturalIdentification(WithMultipliers, eqx.Module):
 @checked
 @working("identify_recording")
 def identify_recording(
-    recording: Recording,
+    recording: RecordingLike,
     sections: Phase | PhaseDefinition,
     inputs: OptionalNames = (),
     outputs: OptionalNames = (),
@@ -198,7 +190,8 @@ def identify_recording(
 
     **Arguments:**
 
-    - `recording`: the recording, perturbed by the inputs, if there are any.
+    - `recording`: the recording, perturbed by the inputs, if there are any; or the path of its
+      file, or a table (`hj.Recording.from_frame`).
     - `sections`, `inputs`, `outputs`, `n_sections`, `bandwidth`, `timing`: those of
       `sample_sections`, with the same defaults.
     - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
@@ -238,6 +231,7 @@ def identify_recording(
         )
     _require_outside(outside or (), (*inputs, *outputs))
     signals = (*inputs, *(outside or ()))
+    recording = as_recording(recording)
     inspection = check_recording(recording, inputs=signals, outputs=outputs)
     refuse(inspection.findings)
     say("phase")

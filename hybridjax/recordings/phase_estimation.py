@@ -15,9 +15,10 @@ from jaxtyping import Float
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked
 from ..errors import DefinitionError
-from ..orbits.crossing import AtEvent, Crossing
+from ..orbits.crossing import Crossing, SectionLike
 from ..sections.families import KinematicPhase
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
+from .read import RecordingLike, as_recording
 from .recording import Recording, signal_of
 from .smoothing import (
     FEWEST,
@@ -32,7 +33,7 @@ from .smoothing import (
 )
 
 
-PhaseDefinition: TypeAlias = KinematicPhase | Crossing | AtEvent
+PhaseDefinition: TypeAlias = KinematicPhase | SectionLike
 """Definition of the phase of a recording; see `estimate_phase`."""
 
 # The rhythm of a trial is estimated from the trial alone if it has this many intervals. More: long
@@ -50,7 +51,7 @@ _SWITCHED = 0.8
 
 @checked
 def estimate_phase(
-    recording: Recording,
+    recording: RecordingLike,
     sections: PhaseDefinition,
     *,
     bandwidth: Bandwidth | None = None,
@@ -59,7 +60,7 @@ def estimate_phase(
 
     **Arguments:**
 
-    - `recording`: the recording.
+    - `recording`: the recording, or the path of its file, or a table (`hj.Recording.from_frame`).
     - `sections`, one of
         - a `KinematicPhase`: the angle of two signals about a center, counted in the sense in which
           it turns.
@@ -67,13 +68,14 @@ def estimate_phase(
           next, linearly in between. The signal should cross the level once in each cycle in this
           direction, and fast: at mid-stance, at the apex. A signal that jumps there, as of a
           trigger, is not smoothed.
-        - `AtEvent`: the phase grows by one from each recorded event to the next, linearly in
-          between. Events that follow the one before by less than half of the trial's median period
-          are taken for doubled and left out; where an interval is longer than 1.5 median periods an
-          event was missed, and these cycles are left out. In irregular rhythms, with intervals of
-          all lengths, these limits are the first gaps in the distribution of intervals. A crossing
-          in a gap counts as missed. This phase, like that of a `Crossing`, depends on the time of
-          the next event, and so do outputs that are sampled at a given phase.
+        - the name of a recorded event, or its `AtEvent`: the phase grows by one from each event to
+          the next, linearly in between. Events that follow the one before by less than half of the
+          trial's median period are taken for doubled and left out; where an interval is longer than
+          1.5 median periods an event was missed, and these cycles are left out. In irregular
+          rhythms, with intervals of all lengths, these limits are the first gaps in the
+          distribution of intervals. A crossing in a gap counts as missed.
+          This phase, like that of a `Crossing`, depends on the time of the next event, and so do
+          outputs that are sampled at a given phase.
     - `bandwidth`: bandwidth in Hz of the splines through the signals. Default: 32 harmonics of the
       cycle for a `KinematicPhase`, 16 for a `Crossing`.
 
@@ -98,6 +100,7 @@ def estimate_phase(
 
     **Before:** `hj.recordings.check_recording`. **After:** `hj.recordings.sample_sections`.
     """
+    recording = as_recording(recording)
     if isinstance(sections, KinematicPhase):
         angles = _angles(recording, sections, bandwidth)
         return _from_angles(angles, sections.n_sections)
@@ -105,7 +108,8 @@ def estimate_phase(
         return _from_crossings(recording, sections, bandwidth)
     if bandwidth is not None:
         raise DefinitionError("events are not smoothed: leave `bandwidth` out.")
-    return _from_events(recording, sections.name)
+    name = sections if isinstance(sections, str) else sections.name
+    return _from_events(recording, name)
 
 
 def _from_crossings(
@@ -337,6 +341,11 @@ def _from_events(recording: Recording, name: str) -> Phase:
     """Return a phase with one cycle per event."""
     times = []
     for trial in recording.trials:
+        if name not in trial.events and name in recording.signals:
+            raise DefinitionError(
+                f"'{name}' is a signal, not an event: `hj.Crossing('{name}', 'falling')` marks the "
+                "beginning of cycles."
+            )
         require_among("event", [name], trial.events, f"trial '{trial.name}': ")
         times.append(trial.events[name])
     intervals = np.concatenate([np.diff(t) for t in times])

@@ -8,6 +8,7 @@ added in `formats/`, and to the readers here.
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from .formats.bag import read_bag
 from .formats.c3d import read_c3d
 from .formats.columns import Columns, Wanted, assumed, parse_table, time_unit
 from .formats.layouts import read_text
-from .recording import Recording, check_events
+from .recording import NamedColumns, Recording, check_events
 
 
 @checked
@@ -104,6 +105,23 @@ def read_recording(
     return Recording.join(
         [_recording(x, wanted, dict(units or {})) for x in map(Path, files)]
     )
+
+
+RecordingLike: TypeAlias = Recording | FilePath | NamedColumns
+"""A recording, the file or the table that it is made of."""
+
+
+def as_recording(given: RecordingLike) -> Recording:
+    """Return a recording: that of a file as `read_recording` reads it, that of a table as
+    `Recording.from_frame` does.
+
+    **Raises:** `DefinitionError` and `FileFormatError` as these.
+    """
+    if isinstance(given, Recording):
+        return given
+    if isinstance(given, str | os.PathLike):
+        return read_recording(given)
+    return Recording.from_frame(given)
 
 
 _READERS = {

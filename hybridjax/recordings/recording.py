@@ -6,9 +6,10 @@ Nothing is resampled or filled in: a missing sample is NaN. The constructor chec
 `_require_increasing`.
 """
 
+import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any, Protocol, TypeAlias
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +20,8 @@ from scipy.optimize.elementwise import find_root
 from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
+from .._core.boundary.members import leading_on
+from .._core.boundary.values import Plain
 from .._core.findings import Finding, print_findings
 from .._core.showable import Showable
 from .._core.signal import with_unit
@@ -27,6 +30,7 @@ from ..errors import DefinitionError
 from ..orbits.crossing import Crossing
 from .formats.columns import (
     Columns,
+    Table,
     assumed,
     numbers,
     parse_table,
@@ -35,6 +39,22 @@ from .formats.columns import (
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
+def _has_columns(value: Any) -> bool:
+    names = ("keys", "column_names")
+    return any(inspect.getattr_static(value, name, None) is not None for name in names)
+
+
+class _Columns(Protocol):
+    def __getitem__(self, name: Any, /) -> Any: ...
+
+
+NamedColumns: TypeAlias = Annotated[
+    _Columns, Plain("a table with named columns", _has_columns)
+]
+"""A table of pandas or pyarrow, or a dictionary of arrays."""
+
+
+@leading_on
 class Trial(eqx.Module):
     """One uninterrupted run of the instruments.
 
@@ -87,7 +107,7 @@ class Recording(Showable, eqx.Module):
     def __init__(
         self,
         time: Any,
-        signals: Mapping[str, Any],
+        signals: Mapping[str, Any] | None = None,
         *,
         events: Mapping[str, Any] | None = None,
         units: Mapping[str, str] | None = None,
@@ -98,7 +118,8 @@ class Recording(Showable, eqx.Module):
 
         **Arguments:**
 
-        - `time` (n,): times of the samples, in seconds; strictly increasing.
+        - `time` (n,): times of the samples, in seconds; strictly increasing. A table with a
+          column `time`, as `from_frame` takes it, stands for times and signals.
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing. Series
           of pandas must have the same index, and their samples the same order.
         - `events`: times of events by name, such as foot strikes.
@@ -109,6 +130,12 @@ class Recording(Showable, eqx.Module):
         """
         where = f"trial '{name}'"
         units = dict(units or {})
+        events = dict(events or {})
+        if signals is None:
+            table = _table_of(where, time, "time")
+            time, signals = table.time, table.signals
+            events = table.events | events
+            units = table.units | units
         require_aligned(where, [time, *signals.values()])
         time = numbers(where, "time", time)
         if not signals:
@@ -116,9 +143,7 @@ class Recording(Showable, eqx.Module):
         columns = {key: numbers(where, key, values) for key, values in signals.items()}
         for key, values in columns.items():
             require_equal(f"{where}: {key} and time", "lengths", len(values), len(time))
-        happened = {
-            key: numbers(where, key, values) for key, values in (events or {}).items()
-        }
+        happened = {key: numbers(where, key, values) for key, values in events.items()}
         for key, values in (happened | columns).items():
             _require_finite(where, key, values)
         _require_increasing(where, time)
@@ -163,9 +188,7 @@ class Recording(Showable, eqx.Module):
         **Raises:** `DefinitionError` if there is no such column, for an unknown unit of time, and
         as `Recording`; `FileFormatError` for two columns of one name.
         """
-        keys = getattr(frame, "column_names", None) or getattr(frame, "keys", list)()
-        columns = Columns({str(key): frame[key] for key in keys})
-        table = parse_table(f"trial '{name}'", columns, time)
+        table = _table_of(f"trial '{name}'", frame, time)
         return cls(
             table.time,
             table.signals,
@@ -357,6 +380,21 @@ def _summary(trial: Trial) -> str:
         parts.append(f"{missing} with gaps")
     parts += [f"{len(at)} {name}" for name, at in trial.events.items()]
     return folded("; ".join(parts), "  ")
+
+
+def _table_of(where: str, frame: Any, time: str) -> Table:
+    """Return times, signals and events of a table with named columns.
+
+    **Raises:** `DefinitionError` for what has no columns, and as `parse_table`.
+    """
+    if not _has_columns(frame):
+        raise DefinitionError(
+            "Recording needs `signals`: `hj.Recording(time, {'name': samples})`, or a table with "
+            f"a column `{time}`."
+        )
+    keys = getattr(frame, "column_names", None) or frame.keys()
+    columns = Columns({str(key): frame[key] for key in keys})
+    return parse_table(where, columns, time)
 
 
 def _minus(curve: CubicSpline, level: float) -> Callable[[Series], Series]:

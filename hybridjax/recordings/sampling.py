@@ -33,6 +33,7 @@ from .data import SectionData
 from .fit_warnings import slow_sampling
 from .phase import HARMONICS, LONGEST_GAP, Phase, Winding
 from .phase_estimation import PhaseDefinition, estimate_phase
+from .read import RecordingLike, as_recording
 from .recording import Recording, Trial
 from .smoothing import (
     FEWEST,
@@ -56,7 +57,7 @@ with the drift."""
 
 @checked
 def sample_sections(
-    recording: Recording,
+    recording: RecordingLike,
     sections: Phase | PhaseDefinition,
     *,
     inputs: OptionalNames,
@@ -79,7 +80,7 @@ def sample_sections(
 
     **Arguments:**
 
-    - `recording`: the recording.
+    - `recording`: the recording, or the path of its file, or a table (`hj.Recording.from_frame`).
     - `sections`: the result of `estimate_phase`, or its argument `sections`.
     - `inputs`, `outputs`: names of signals. Without outputs, `()`, only the times of the events are
       known: `timing` is then "duration". Without inputs, `()`, the data are for
@@ -120,6 +121,7 @@ def sample_sections(
     """
     inputs = tuple(inputs)
     outputs = tuple(outputs)
+    recording = as_recording(recording)
     _require_signals(recording, (*inputs, *outputs))
     phase = sections
     if not isinstance(phase, Phase):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import ExperimentCount, Seed, Vector
+from .._core.boundary.kinds import ExperimentCount, Scalar, Seed, Vector
 from .._core.meaning import current_of_many
 from .._core.pieces.description import digest_of
 from .._core.pieces.store import Constant
@@ -33,6 +33,9 @@ from ..systems.varied import parameter_of, with_parameters
 
 Axes = Mapping[str, Vector]
 """Values of parameters by name."""
+
+Axis = Vector | Scalar
+"""Values of one parameter: several, or one."""
 
 
 @checked

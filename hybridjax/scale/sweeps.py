@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from .._core.arguments import searching
-from .._core.boundary.checked import checked
+from .._core.boundary.checked import checked, taken_parameters
 from .._core.boundary.kinds import Count, FilePath
 from .._core.execution import Execution
 from .._core.pieces.description import digest_of, versions
@@ -32,8 +32,8 @@ from ..orbits.limit_cycles import (
 )
 from ..orbits.return_map import ReturnMap
 from ..orbits.verdict import require_sound
-from ..systems.system import HybridSystem
-from .family import Axes, Family, Space, SweepPoints
+from ..systems.system import HybridSystem, parameters_of
+from .family import Axis, Family, Space, SweepPoints
 from .wanted import Measure, Want, Wanted
 
 
@@ -56,7 +56,7 @@ _DIGITS = 7
 @working("sweep")
 def sweep(
     model: HybridSystem | Callable[..., HybridSystem],
-    values: Axes | SweepPoints,
+    values: Mapping[str, Axis] | SweepPoints | None = None,
     quantities: Want | Measure | Sequence[Want | Measure] = (
         "period",
         "spectral_radius",
@@ -66,6 +66,7 @@ def sweep(
     chunk: Count | None = None,
     store: FilePath | None = None,
     client: DaskClient | None = None,
+    **parameters: Axis,
 ) -> Any:
     """Find limit cycles over a space of parameters, as a labelled array.
 
@@ -81,7 +82,9 @@ def sweep(
     - `model`: a system, some of whose scalar parameters take the values given (names may have
         dots); or a function of these parameters that returns a system.
     - `values`: values of each parameter by name, of which all combinations are taken; or
-        `hj.scale.SweepPoints`.
+        `hj.scale.SweepPoints`. A number is the only value of its parameter.
+    - `parameters`: such values as keywords, `hj.sweep(system, k=[9, 10])`, of parameters without
+        dots in their names.
     - `quantities`: quantities to keep of each cycle: "period", "state" (at its phase origin, with
         the chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
         functions of a `LimitCycle`, kept under their names, that return a number or an array of
@@ -107,8 +110,7 @@ def sweep(
     **Example:**
 
     ```python
-    values = {"k": np.linspace(9, 11, 4), "b": np.linspace(4, 6, 3)}
-    found = hj.sweep(hopper, values)
+    found = hj.sweep(hopper, k=np.linspace(9, 11, 4), b=np.linspace(4, 6, 3))
     found.spectral_radius.plot()
     ```
 
@@ -116,13 +118,7 @@ def sweep(
     **After:** functions of `xarray`.
     """
     require_x64()
-    given = values.values if isinstance(values, SweepPoints) else values
-    axes = {name: np.asarray(x, float) for name, x in given.items()}
-    if not axes or not all(map(len, axes.values())):
-        raise DefinitionError(
-            "`values` must name at least one parameter, each with a value or more."
-        )
-    space = Space(axes, not isinstance(values, SweepPoints))
+    space = _space(model, values, parameters)
     family = Family(model, list(space.axes))
     middle = {}
     for name, x in space.axes.items():
@@ -153,6 +149,46 @@ def sweep(
         description=description,
     )
     return fill(job, store, client).dataset()
+
+
+def _space(
+    model: HybridSystem | Callable[..., HybridSystem],
+    values: Mapping[str, Any] | SweepPoints | None,
+    parameters: Mapping[str, Any],
+) -> Space:
+    """Return the points of a sweep, from values by name, in a table or as keywords.
+
+    **Raises:** `DefinitionError` without values, for a keyword that is no parameter, and for a
+    parameter that is given twice.
+    """
+    parameters = taken_parameters(sweep, model, parameters)
+    if isinstance(values, SweepPoints):
+        if parameters:
+            raise DefinitionError(
+                "`hj.scale.SweepPoints` hold the values of all parameters: leave out "
+                f"`{next(iter(parameters))}`."
+            )
+        return Space(values.values, grid=False)
+    by_name = dict(values or {})
+    for name in parameters:
+        if name in by_name:
+            raise DefinitionError(f"`{name}` is given twice: leave it out of `values`.")
+    axes = {
+        name: np.atleast_1d(np.asarray(x, float))
+        for name, x in (by_name | parameters).items()
+    }
+    if not axes or not all(map(len, axes.values())):
+        raise DefinitionError(
+            "a sweep needs at least one parameter with a value or more, as in "
+            f"`hj.sweep(system, {_example(model)}=[0.1, 0.5])`."
+        )
+    return Space(axes, grid=True)
+
+
+def _example(model: Any) -> str:
+    """Return the name of a parameter."""
+    names = parameters_of(model) if isinstance(model, HybridSystem) else {}
+    return next((name for name in names if "." not in name), "k")
 
 
 class Begun(NamedTuple):

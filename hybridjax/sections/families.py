@@ -24,7 +24,13 @@ from .._core.precision import real
 from .._core.text import fields
 from ..engine.target import AbstractLevels as AbstractLevels
 from ..errors import DefinitionError
-from ..orbits.crossing import AtEvent, Crossing, ListLevels
+from ..orbits.crossing import (
+    AtEvent,
+    Crossing,
+    ListLevels,
+    SectionLike,
+    as_section,
+)
 from ..systems.structure import Outputs, Structure
 
 
@@ -366,7 +372,7 @@ class SectionList(AbstractSections):
     """Sections one by one. Where they are placed on a cycle, the first one stays section 0, and the
     others are sorted by the order in which the cycle meets them.
 
-    **Fields:** `items`: a list of `Crossing` and `AtEvent`.
+    **Fields:** `items`: a list of `Crossing` and `AtEvent`, which the name of an event stands for.
 
     **Example:**
 
@@ -381,9 +387,9 @@ class SectionList(AbstractSections):
     label: ClassVar[str] = "sections"
     items: tuple[Crossing | AtEvent, ...]
 
-    def __init__(self, items: Iterable[Crossing | AtEvent]):
+    def __init__(self, items: Iterable[SectionLike]):
         """**Raises:** `DefinitionError` for an empty list."""
-        self.items = tuple(items)
+        self.items = tuple(map(as_section, items))
         if not self.items:
             raise DefinitionError(
                 "a list of sections needs one Crossing or AtEvent, or more."
@@ -411,9 +417,10 @@ class SectionList(AbstractSections):
 
 
 FamilyLike: TypeAlias = (
-    AbstractSections | Crossing | AtEvent | SectionCount | Sequence[Crossing | AtEvent]
+    AbstractSections | SectionLike | SectionCount | Sequence[SectionLike]
 )
-"""A family, a single section, the number of sections of a clock, or a list of sections."""
+"""A family, a single section, the number of sections of a clock, or a list of sections. An event is
+given by its name, too."""
 
 
 def as_family(sections: FamilyLike) -> AbstractSections:
@@ -421,6 +428,6 @@ def as_family(sections: FamilyLike) -> AbstractSections:
     clock sections, or a list of sections."""
     if isinstance(sections, int):
         return ClockPhase(sections)
-    if isinstance(sections, Crossing | AtEvent):
+    if isinstance(sections, Crossing | AtEvent | str):
         return SectionList([sections])
     return sections if isinstance(sections, AbstractSections) else SectionList(sections)

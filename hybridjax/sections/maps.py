@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._core.arguments import require_axes, require_index
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index, Numbers, Scalar
+from .._core.boundary.members import leading_on
 from .._core.boundary.values import Reals
 from .._core.compilation import host_first, on_the_host
 from .._core.executor import is_traced, namespace, put
@@ -36,6 +37,7 @@ from .placed import PlacedSections, SectionsLike, followed_at_once
 _PATIENCE = 100
 
 
+@leading_on
 class Arrival(NamedTuple):
     """The time and the state at which a trajectory arrives on the second section of a section map.
     If it does not arrive, time, state and their derivatives are NaN."""

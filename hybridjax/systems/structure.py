@@ -326,7 +326,13 @@ class Structure:
         return _index("chart", name, self.names)
 
     def transition_index(self, name: str) -> int:
-        return _index("event", name, [t.name for t in self.transitions])
+        events = [t.name for t in self.transitions]
+        if name not in events and name in self.output_names():
+            raise DefinitionError(
+                f"'{name}' is a signal, not an event: `hj.Crossing('{name}', 'falling')` is a "
+                "section."
+            )
+        return _index("event", name, events)
 
     def method(self, a: int) -> Method:
         """The method by which chart a is integrated: that of the system, of the chart, or the

@@ -11,6 +11,7 @@ import contextvars
 import copy
 import dataclasses
 import functools as ft
+import inspect
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -400,7 +401,8 @@ class HybridSystem(Definition):
 
         - `states`: names, or units by name, as in `{"y": "m", "v": "m/s"}`.
         - `field`: the vector field, `(t, q, u, p)` -> n numbers. t is the time, q (n,) the state,
-          u the inputs. `p.g` is the parameter g.
+          u the inputs. `p.g` is the parameter g. Each function may leave out the last arguments,
+          as `(t, q)` -> n numbers.
         - `events`: for each its name, its guard `(t, q, u, p)` -> number, which falls through zero
           at the event, and its reset `(t, q, u, p)` -> state after it.
         - `parameters`: values by name. They can be fitted, swept and differentiated by.
@@ -520,8 +522,26 @@ class _Functions(NamedTuple):
 
 
 def _with_parameters(function: Callable[..., Any], system: HybridSystem) -> Callable:
-    """Return a function (t, q, u) from one of (t, q, u, p)."""
-    return lambda t, q, u: function(t, q, u, system)
+    """Return a function (t, q, u) from one of (t, q, u, p), or of the first of these."""
+    count = _count_taken(function)
+    return lambda t, q, u: function(*(t, q, u, system)[:count])
+
+
+def _count_taken(function: Callable[..., Any]) -> int:
+    """The number of (t, q, u, p) that a function takes; all of them where its signature is unknown,
+    or has no end."""
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):
+        return 4
+    if any(x.kind is x.VAR_POSITIONAL for x in parameters):
+        return 4
+    # (Others with defaults belong to the author, as k in `lambda t, q, k=k: ...`.)
+    by_position = [x for x in parameters if x.kind <= x.POSITIONAL_OR_KEYWORD]
+    taken = [x for x in by_position if x.default is x.empty or x.name in ("u", "p")]
+    if len(taken) == 3 and taken[2].name == "p":  # (It would get the inputs.)
+        return 4
+    return min(max(len(taken), 2), 4)
 
 
 def integrated(system: HybridSystem, solver: Any) -> HybridSystem:

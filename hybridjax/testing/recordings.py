@@ -25,6 +25,7 @@ from ..errors import DefinitionError
 from ..experiments.response import response_function
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle
+from ..recordings.read import RecordingLike, as_recording
 from ..recordings.recording import Recording
 from ..sections.families import ClockPhase
 from ..systems.system import OutputNames
@@ -119,7 +120,7 @@ _respond = quick_jit(lambda response, u: response(u).y)
 
 @checked
 def add_artifacts(
-    recording: Recording,
+    recording: RecordingLike,
     signals: SignalNames,
     *,
     noise: NonNegative = 0.0,
@@ -133,7 +134,8 @@ def add_artifacts(
 
     **Arguments:**
 
-    - `recording`: the recording, which stays as it is.
+    - `recording`: the recording, which stays as it is, or the path of its file, or a table
+      (`hj.Recording.from_frame`).
     - `signals`: names of the corrupted signals; all others stay as they are.
     - `noise`: standard deviation of white noise. `quantum`: step to which values are rounded. Both
       in the unit of the signals. Default: 0.
@@ -159,6 +161,7 @@ def add_artifacts(
     """
     if gap is not None and gap[0] >= gap[1]:
         raise DefinitionError(f"`gap` must end after it starts, but is {gap}.")
+    recording = as_recording(recording)
     rng = np.random.default_rng(seed)
     columns = [recording.column(x) for x in signals]
     trials = []

@@ -10,7 +10,7 @@ import functools
 import inspect
 import sys
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NamedTuple, TypeVar, cast
 
 import equinox as eqx
@@ -121,6 +121,34 @@ def check_fields(cls: type, args: tuple, kwargs: dict[str, Any]) -> None:
         ) from None
 
 
+def taken_parameters(
+    function: Callable, thing: Any, given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the keywords of a call that are no arguments of a public function, but parameters of a
+    system, or of the system of a limit cycle, in the form of their kind. (Names of other things, as
+    of a function that makes systems, are not checked.)
+
+    **Raises:** `WrongArguments` for a name that is no parameter; `DefinitionError` for a value that
+    does not fit.
+    """
+    kinds: _Kinds = getattr(function, "kinds")  # noqa: B009
+    is_known = leads.parameters_of(thing)
+    called = function.__name__
+    taken = {}
+    for name, value in given.items():
+        if is_known and name not in is_known:
+            visible = [x for x in kinds.by_name if x not in given]
+            raise WrongArguments(leads.about_keyword(called, name, visible, thing))
+        try:
+            taken[name] = kinds.of_parameters.take(value)
+        except Misfit as misfit:
+            lead = leads.about_object(called, kinds.of_parameters, value)
+            raise DefinitionError(
+                f"{called}: `{misfit.of(name).path}` {misfit.problem}{lead}."
+            ) from None
+    return taken
+
+
 def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable:
     kinds = _Kinds(function, cls)
 
@@ -206,6 +234,11 @@ class _Kinds:
                 rest = name
         return named, (rest, self.by_name.get(rest))
 
+    @functools.cached_property
+    def of_parameters(self) -> Kind:
+        """The kind of further keywords, `**parameters`, which `taken_parameters` checks."""
+        return cast(Kind, kind_of(self.hints()["parameters"]))
+
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.
 
@@ -274,6 +307,10 @@ class _Kinds:
         percent = leads.about_percent(kind, value)
         if percent:
             return percent
+        called = self.function if self.cls is None else self.cls
+        certain = leads.about_argument(called.__qualname__, name, value, args)
+        if certain:
+            return certain
         # (What is given by name is not in the wrong order.)
         positional = [] if by_name else self.in_order[0]
         for (other, other_kind), given in zip(positional, args, strict=False):
@@ -281,7 +318,6 @@ class _Kinds:
                 continue
             if _fits(kind, given) and _fits(other_kind, value):
                 return f": `{name}` and `{other}` may be in the wrong order"
-        called = self.function if self.cls is None else self.cls
         return leads.about_object(called.__qualname__, kind, value, args)
 
     @functools.cached_property

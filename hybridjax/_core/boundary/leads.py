@@ -117,7 +117,7 @@ def _about_part(thing: Any, name: str) -> str:
     for other names."""
     if _is_system(thing):
         return ""
-    if name in _parameters(thing):
+    if name in parameters_of(thing):
         return f": `.system.{name}` is a parameter of its system"
     if name not in _signals(thing):
         return ""
@@ -242,7 +242,7 @@ def _in_names_of(given: Sequence[Any], sentence: str) -> str:
     """Return a sentence on a signal 'y' and a parameter 'k' with names of what was given."""
     named = [x for x in given if isinstance(x, str)]
     for thing in given:
-        for letter, names in (("'y'", _signals(thing)), ("'k'", _parameters(thing))):
+        for letter, names in (("'y'", _signals(thing)), ("'k'", parameters_of(thing))):
             if names:
                 meant = [name for name in named if name in names] or names
                 sentence = sentence.replace(letter, f"'{meant[0]}'")
@@ -267,7 +267,7 @@ def _signals(thing: Any) -> list[str]:
         return []
 
 
-def _parameters(thing: Any) -> list[str]:
+def parameters_of(thing: Any) -> list[str]:
     system = getattr(thing, "system", thing)
     if not _is_system(system):
         return []
@@ -306,20 +306,43 @@ def _leads_of_argument(
     own = [function]
     for word in (name, *words.synonyms(name)):
         yield words.lead_of(KEYWORDS, own, word)
-    parameter = _parameter_like(name, _parameters(first))
-    if parameter is not None:
-        about = words.lead_of(KEYWORDS, own, "parameter")
-        yield about and about.replace("'k'", f"'{parameter}'")
-        yield f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
+    yield _about_parameter(own, _parameter_like(name, parameters_of(first)))
     yield _use(_synonym(name, parameters))
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]
     yield words.lead_of(KEYWORDS, owners, name)
+    yield _about_parameter(own, _described(first, name))
     yield _use(spelled_alike(name, parameters))
+    yield _about_parameter(own, _described(first, name, alike=True))
     for part in words.parts(name):
         yield _use(words.with_part(part, parameters))
         yield words.lead_of(KEYWORDS, owners, part)
     yield _use(spelled_alike(name, parameters, _ALIKE))
+
+
+def _about_parameter(function: Sequence[str], parameter: str | None) -> str | None:
+    """Return how a function gets a parameter of its system."""
+    if parameter is None:
+        return None
+    about = words.lead_of(KEYWORDS, function, "parameter")
+    if about is not None:
+        return about.replace("'k'", f"'{parameter}'").replace("k=", f"{parameter}=")
+    return (
+        f"`system.replace({parameter}=...)` returns a system with another `{parameter}`"
+    )
+
+
+def _described(thing: Any, word: str, alike: bool = False) -> str | None:
+    """Return the parameter of a system in whose description a word stands, or one like it."""
+    system = getattr(thing, "system", thing)
+    if not _is_system(system):
+        return None
+    described: dict[str, str] = {}
+    for field in dataclasses.fields(system):
+        for x in field.metadata.get("doc", "").split():
+            described.setdefault(x, field.name)
+    meant = spelled_alike(word, [x for x in described if len(x) > 4]) if alike else word
+    return described.get(meant or "")
 
 
 def _parameter_like(name: str, parameters: Collection[str]) -> str | None:
@@ -335,7 +358,10 @@ def _synonym(name: str, among: Collection[str]) -> str | None:
 
 
 def about_object(
-    function: str, kind: Kind | None, value: Any, given: Sequence[Any] = ()
+    function: str,
+    kind: Kind | None,
+    value: Any,
+    given: Sequence[Any] = (),
 ) -> str:
     """Return the rest of a sentence about a value that a function cannot use: the call that makes
     the object it needs, or the part of the value that it needs; "" if none is known.
@@ -344,6 +370,24 @@ def about_object(
     names the call has.
     """
     return _in_names_of(given, _about_object(function, kind, value))
+
+
+def about_argument(
+    function: str, argument: str, value: Any, given: Sequence[Any]
+) -> str:
+    """Return what to do where one argument of a function was given a value of some type, as the
+    rest of a sentence; "" if nothing is known.
+
+    **Arguments:** as `about_object`.
+    """
+    lead = _of_type(f"{function.rpartition('.')[2]}.{argument}", value)
+    return "" if lead is None else f": {_in_names_of(given, lead)}"
+
+
+def _of_type(place: str, value: Any) -> str | None:
+    """Return the sentence of the table for a place, and the type of a value."""
+    leads = (OBJECTS.get(f"{place}.{base.__name__}") for base in type(value).__mro__)
+    return next((lead for lead in leads if lead is not None), None)
 
 
 def about_percent(kind: Kind | None, value: Any) -> str:
@@ -357,10 +401,9 @@ def about_percent(kind: Kind | None, value: Any) -> str:
 
 def _about_object(function: str, kind: Kind | None, value: Any) -> str:
     for name in (function, function.rpartition(".")[2]):
-        for base in type(value).__mro__:
-            lead = OBJECTS.get(f"{name}.{base.__name__}")
-            if lead is not None:
-                return f": {lead}"
+        lead = _of_type(name, value)
+        if lead is not None:
+            return f": {lead}"
     wanted = list(classes_in(kind))
     if _is_class_of(value, wanted):
         return f": make one, as `{value.__name__}()`"

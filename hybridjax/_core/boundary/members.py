@@ -9,13 +9,16 @@ import functools
 import inspect
 import types
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 
 from ..exceptions import HybridJaxError, UnknownAttribute
 from . import leads
 from .values import with_article
+
+
+Class = TypeVar("Class", bound=type)
 
 
 class FixedAttribute(HybridJaxError, dataclasses.FrozenInstanceError):
@@ -31,6 +34,12 @@ def missing_attribute(self: Any, name: str) -> Any:
         return object.__getattribute__(self, name)
     about = functools.partial(leads.about_attribute, type(self), name, self)
     raise UnknownAttribute(about)
+
+
+def leading_on(cls: Class) -> Class:
+    """A class whose missing attributes lead on: a small part of a result."""
+    setattr(cls, "__getattr__", missing_attribute)  # noqa: B010
+    return cls
 
 
 def fixed_attribute(self: Any, name: str, value: Any) -> None:

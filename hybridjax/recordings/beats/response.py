@@ -20,11 +20,12 @@ from ..._core.showable import Showable
 from ..._core.signal import Signal, with_unit
 from ..._core.text import rounded, standard_error
 from ...errors import DefinitionError
-from ...orbits.crossing import AtEvent, Crossing
+from ...orbits.crossing import SectionLike
 from ...orbits.responses import PhaseCurve
 from ..fit_warnings import about_phase_response
 from ..phase import Phase
 from ..phase_estimation import estimate_phase
+from ..read import RecordingLike, as_recording
 from ..recording import Recording
 from ..smoothing import Series
 from .estimation import (
@@ -180,7 +181,7 @@ class PhaseResponse(PhaseCurve):
         return basis(x, len(self.coefficients) - 1, self.jitter) @ self.coefficients
 
     def forecast(
-        self, recording: Recording, sections: Phase | AtEvent | Crossing
+        self, recording: RecordingLike, sections: Phase | SectionLike
     ) -> IntervalForecast:
         """Forecast the intervals of a recording, such as one to which the curve was not fitted.
 
@@ -203,6 +204,7 @@ class PhaseResponse(PhaseCurve):
         print(curve.forecast(other, hj.AtEvent("beat")).explained)
         ```
         """
+        recording = as_recording(recording)
         intervals = _intervals(recording, sections, str(self.input))
         fit = fit_rates(intervals, self.coefficients, self.jitter)
         left = float((fit.residual[fit.used] ** 2).sum())
@@ -247,8 +249,8 @@ class PhaseResponse(PhaseCurve):
 @checked
 @working("phase_response")
 def phase_response(
-    recording: Recording,
-    sections: Phase | AtEvent | Crossing,
+    recording: RecordingLike,
+    sections: Phase | SectionLike,
     input: str,
 ) -> PhaseResponse:
     r"""Estimate the phase response curve of spikes, heartbeats, taps or steps under a known input.
@@ -270,9 +272,10 @@ def phase_response(
 
     **Arguments:**
 
-    - `recording`: the recording, with the events and the input.
-    - `sections`: the event at which each cycle begins, or a `Phase` estimated from events or
-      crossings.
+    - `recording`: the recording, with the events and the input, or the path of its file, or a table
+      (`hj.Recording.from_frame`).
+    - `sections`: the event at which each cycle begins, by its name, or a `Phase` estimated from
+      events or crossings.
     - `input`: the name of the signal that acted; linear between its samples. It must not depend on
       the rhythm (no feedback). The curve and the rates are those of the rhythm under the mean of
       this signal in each trial.
@@ -296,6 +299,7 @@ def phase_response(
 
     **Before:** `hj.read_recording`. **After:** `hj.plot.phase_response`.
     """
+    recording = as_recording(recording)
     intervals = _intervals(recording, sections, input)
     total = len(intervals.start)
     if total < 2 * (11 + intervals.trial[-1]):  # half of them for errors
@@ -339,7 +343,7 @@ def phase_response(
 
 
 def _intervals(
-    recording: Recording, sections: Phase | AtEvent | Crossing, name: str
+    recording: Recording, sections: Phase | SectionLike, name: str
 ) -> Intervals:
     """Return the intervals between events, with the input of that name."""
     phase = sections

@@ -19,6 +19,7 @@ from ..._core.findings import Finding, warn_of
 from ..data import SectionData
 from ..findings import Inspection, places
 from ..phase import Phase
+from ..read import RecordingLike, as_recording
 from ..recording import Recording, Trial
 from ..smoothing import FEWEST
 from . import differences, failures
@@ -39,10 +40,10 @@ _TEXTS = {
 
 @checked
 def check_recording(
-    recording: Recording,
+    recording: RecordingLike,
     *,
     inputs: OptionalNames = (),
-    outputs: OptionalNames,
+    outputs: OptionalNames | None = None,
     phase: Phase | None = None,
     data: SectionData | None = None,
 ) -> Inspection:
@@ -56,8 +57,9 @@ def check_recording(
 
     **Arguments:**
 
-    - `recording`: the recording.
-    - `inputs`, `outputs`: names of signals; others are not inspected. Default of `inputs`: none.
+    - `recording`: the recording, or the path of its file, or a table (`hj.Recording.from_frame`).
+    - `inputs`, `outputs`: names of signals; others are not inspected. Default of `inputs`: none; of
+      `outputs`: all signals that are no inputs.
     - `phase`, `data`: phase and data at the sections, of this recording or of the one that an
       inspection returned. Default: None.
 
@@ -76,7 +78,9 @@ def check_recording(
     **Before:** `hj.read_recording`. **After:** `hj.recordings.estimate_phase`.
     """
     inputs = tuple(inputs)
-    outputs = tuple(outputs)
+    recording = as_recording(recording)
+    others = [name for name in recording.signals if name not in inputs]
+    outputs = tuple(others if outputs is None else outputs)
     require_apart(inputs, outputs)
     names = [
         name

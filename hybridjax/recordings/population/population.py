@@ -114,10 +114,14 @@ class Population(Showable):
     @classmethod
     def from_fits(
         cls,
-        fits: Sequence[MultiplierFit | NaturalMultipliers],
-        table: Columns,
+        fits: Sequence[MultiplierFit | NaturalMultipliers]
+        | Mapping[str, MultiplierFit | NaturalMultipliers],
+        table: Columns | Sequence[str] | None = None,
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
+
+        The names of the subjects alone, `from_fits(fits, ["S1", "S2"])`, or fits by name,
+        `from_fits({"S1": fit, "S2": other})`, stand for a table.
 
         Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, its
         `decay` (the rate -ln(modulus) per stride: half of a deviation is left after
@@ -127,7 +131,16 @@ class Population(Showable):
         **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
         differ.
         """
-        frame = table_of(table, len(fits))
+        if isinstance(fits, Mapping):
+            table = list(fits) if table is None else table
+            fits = list(fits.values())
+        if table is None:
+            raise DefinitionError(
+                "Population.from_fits needs the subjects of the fits: `from_fits(fits, ['S1', "
+                "'S2'])`, or a table with a column 'subject'."
+            )
+        rows = table if isinstance(table, Columns) else {"subject": list(table)}
+        frame = table_of(rows, len(fits))
         _require_comparable(fits, frame["subject"])
         most = max((len(fit.coefficients) for fit in fits), default=0)
         kinds = ["modulus", "angle", "decay"]

@@ -342,11 +342,28 @@ ATTRIBUTES = {
         ),
     },
     "OptimalDesign": {
+        "`plan.design.write(path)` writes a table": "write save export to_csv to_file",
         "`plan.cycles_for(standard_error)` returns the number of cycles": (
             "n_cycles n_strides strides sample_size required power_analysis"
         ),
         "`plan.saved` is the factor against the usual design": (
             "efficiency gain factor ratio d_efficiency"
+        ),
+    },
+    "Flow": {
+        "`jax.jacfwd` of a function that returns `hj.flow(...).state` is its Jacobian": (
+            "jacobian jac monodromy stm gradient grad derivative sensitivity"
+        ),
+    },
+    "Event": {
+        "`event.before` and `event.after` have the states by name": (
+            "states q x y values jump"
+        ),
+    },
+    "Trial": {
+        "`recording.plot()` draws the signals": "plot",
+        "`recording[name]` has the samples of a signal, `trial.values` those of all": (
+            "data x y signals get_data"
         ),
     },
     "Trajectory": {

@@ -78,6 +78,17 @@ KEYWORDS = {
         ),
         "pass `settings=hj.orbits.Settings(rtol=1e-9, max_steps=20_000)`": "settings",
     },
+    "flow": {
+        "use `until`, the time at the end": (
+            "t1 t_end t_final duration t_span t stop tf end length"
+        ),
+        "a `Guess` has the time at the start: `hj.Guess(chart, state, time)`": (
+            "t0 t_start time"
+        ),
+        "`start` is the chart, the state and the time: `hj.Guess(chart, state, time)`": (
+            "chart state"
+        ),
+    },
     "simulate": {
         "`cycle.trajectory(periods)` follows a cycle": "n_cycles cycles periods",
         "events are transitions of the system, as in `hj.HybridSystem.from_functions(states, "
@@ -171,7 +182,7 @@ KEYWORDS = {
         ),
     },
     "continuation": {
-        "pass its name and range: `hj.continuation(cycle, 'k', (low, high))`": (
+        "pass its range by its name: `hj.continuation(cycle, k=(low, high))`": (
             "parameter icp par active_parameter continuation_parameter"
         ),
         "use `range`, (low, high)": (
@@ -185,14 +196,13 @@ KEYWORDS = {
         ),
         "the branch goes to both ends of the range": "direction backward forward bothside",
     },
-    "identify_subjects": {
-        "`identify=functools.partial(hj.identify_recording, sections=..., inputs=..., "
-        "outputs=...)` identifies each recording": (
-            "inputs outputs sections order n_sections"
+    "natural_multipliers": {
+        "`hj.identify_recording(recording, sections, outputs=...)` takes recordings": (
+            "outputs sections n_sections inputs signals bandwidth"
         ),
     },
     "sweep": {
-        "pass the values by name: `hj.sweep(system, {'k': values})`": (
+        "pass the values by name: `hj.sweep(system, k=values)`": (
             "parameter range grid"
         ),
     },
@@ -217,10 +227,10 @@ KEYWORDS = {
 """What to do instead of an argument that a function has not."""
 
 NEEDS = {
-    "continuation.range": "(low, high), as in `hj.continuation(cycle, 'k', (0.1, 0.5))`, with the "
-    "value of the cycle's system between them",
-    "sweep.values": "values by name, as in `hj.sweep(system, {'k': [0.1, 0.5]})`",
     "data": "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
+    "validate.data": "data to which the model was not fitted: `hj.run_experiments` makes some, and "
+    "`hj.identify_recording(recording, ...).data` those of another recording",
+    "Population.values": "`hj.recordings.Population.from_fits(fits, subjects)` takes fits",
     "order": "the number of multipliers, which `hj.select_order(htf)` helps to find",
     "sections": "`hj.ClockPhase(32)`, or `hj.Crossing('y', 'falling')`, are some",
     "estimate_phase.sections": "an event that happens once a cycle, such as "

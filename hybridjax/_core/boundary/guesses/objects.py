@@ -39,6 +39,14 @@ MAKERS = {
 
 STEPS = {
     (
+        "HybridSystem",
+        "function",
+    ): "`hj.HybridSystem.from_functions(('x', 'v'), field)` makes one of a function (t, q)",
+    (
+        "HybridSystem",
+        "str",
+    ): "models are objects, such as `hj.models.VerticalHopper()`",
+    (
         "Phase",
         "ClockPhase",
     ): "recordings have no clock; its ticks are events: "
@@ -100,6 +108,18 @@ STEPS = {
         "LimitCycle",
     ): "`hj.run_experiments(cycle, sections, design, outputs)` makes data",
     ("HasRecords", "LDTP"): "are `model` and `data` in the wrong order?",
+    (
+        "SectionData",
+        "Recording",
+    ): "`hj.identify_recording(recording, sections, outputs=...)` takes recordings",
+    (
+        "HasRecords",
+        "str",
+    ): "`hj.identify_recording(path, ...).data` are those of a recording",
+    (
+        "HasRecords",
+        "Path",
+    ): "`hj.identify_recording(path, ...).data` are those of a recording",
     ("ParameterFit", "MultiplierFit"): "`other.compare(fit)` compares multipliers",
     ("Recording", "ExperimentData"): "`hj.fit_series(data, order)` takes such data",
     (
@@ -110,6 +130,10 @@ STEPS = {
         "AbstractObservation",
         "HTF",
     ): "`hj.fitting.ObservedHTF(htf, sections)` makes one of an HTF",
+    (
+        "AbstractObservation",
+        "Recording",
+    ): "`hj.fitting.ObservedTrajectory(start, times, outputs, values)` makes one of values",
     (
         "AbstractObservation",
         "ExperimentData",
@@ -128,7 +152,7 @@ OBJECTS = {
     "optimal_design.float": "name the signal: `limit={'u': 0.01}` is its largest rms",
     "identify_recording.list": "`hj.Recording.join(recordings)` makes trials of one recording; of "
     "several subjects, `hj.identify_subjects(table, folder)`",
-    "Population.list": "`hj.recordings.Population.from_fits(fits, labels)` takes fits",
+    "Population.list": "`hj.recordings.Population.from_fits(fits, subjects)` takes fits",
     "responses.str": "`cycle.responses().curve('u')` is that to one input",
     "fluctuations.float": "name the signal: `white={'y': 0.01}`",
     "fit_model.Identification": "`hj.fitting.ObservedSeries(result.data, sections)` makes one",
@@ -137,14 +161,38 @@ OBJECTS = {
     "fit_series.LDTP": "are the model and the data in the wrong order?",
     "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
     "continuation.float": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
-    "identify_recording.int": "it is the event at which cycles begin, such as "
+    "ClockPhase.anchor.str": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "ArcLength.anchor.str": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "KinematicPhase.anchor.str": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "KinematicPhase.position.tuple": "pass two names: `hj.KinematicPhase(8, 'y', 'v')`",
+    "KinematicPhase.position.list": "pass two names: `hj.KinematicPhase(8, 'y', 'v')`",
+    "identify_recording.sections.tuple": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "identify_recording.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "estimate_phase.sections.tuple": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "estimate_phase.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "sample_sections.sections.tuple": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "sample_sections.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "linearize.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
+    "simulate.chart.Trajectory": "`hj.flow(system, flow, until)` goes on from the end of a flow",
+    "__call__.names.float": "`trajectory.at(times)` has the states at any times",
+    "__call__.names.int": "`trajectory.at(times)` has the states at any times",
+    "multipliers.estimates.ndarray": "pass the fit, which has regions: `hj.plot.multipliers(true, "
+    "fit)`",
+    "simulate.u.Design": "`hj.experiments.simulate_experiments(model, design)` runs one on a model",
+    "simulate.chart.float": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
+    "simulate.chart.int": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
+    "identify_recording.sections.int": "it is the event at which cycles begin, such as "
     "`hj.Crossing('y', 'falling')`; `n_sections` is a number",
-    "Guess.dict": "pass the values in the order of the chart's states",
-    "identify_subjects.list": "`hj.recordings.Population.from_fits(fits, labels)` compares fits",
+    "Guess.dict": "pass the values in the order of the chart's states, or such a state in place of "
+    "the guess: `hj.find_limit_cycle(system, {'y': 2.0, 'v': 0.0})`",
+    "identify_subjects.list": "name the files: `hj.identify_subjects({'file': files, 'subject': "
+    "names}, folder, ...)`; `hj.recordings.Population.from_fits(fits, subjects)` compares fits",
+    "cycle.x.tuple": "pass two names: `hj.plot.cycle(cycle, x, y)`",
+    "cycle.x.list": "pass two names: `hj.plot.cycle(cycle, x, y)`",
     "multisine.AbstractSections": "pass `sections.n_sections`",
     "read_recording.DataFrame": "`hj.Recording.from_frame(table)` takes tables",
     "Recording.ndarray": "`hj.Recording(time, {'name': samples})` names each signal",
-    "sweep.str": "pass the values by name: `hj.sweep(system, {'k': values})`",
+    "sweep.values.str": "pass the values by name: `hj.sweep(system, k=values)`",
     "save.Showable": "`hj.save('name.npz', result)` takes the name first",
     "save.LimitCycle": "it contains the code of its system; `cycle.to_pandas()` has its numbers",
     "__getitem__.list": "it takes one name at a time; `result.to_pandas()[names]` has several",
@@ -164,5 +212,5 @@ OBJECTS = {
     "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
 }
-"""For a function, and the type of the object that it was given, what to do. A given type also
-stands for those derived from it."""
+"""For a function, or one of its arguments, and the type of the object that it was given, what to
+do. A given type also stands for those derived from it."""

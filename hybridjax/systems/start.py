@@ -1,0 +1,105 @@
+"""What moves, and where it begins, as users give it: a system or its field, a state or a guess."""
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, TypeAlias
+
+import jax
+import numpy as np
+
+from .._core.boundary.kinds import Numbers, Scalar
+from .._core.boundary.values import Plain, Reals
+from ..errors import DefinitionError
+from .structure import Structure
+from .system import Guess, HybridSystem
+
+
+def _is_field(value: Any) -> bool:
+    of_package = type(value).__module__.partition(".")[0] == __name__.partition(".")[0]
+    return callable(value) and not isinstance(value, type) and not of_package
+
+
+SystemLike: TypeAlias = (
+    HybridSystem | Annotated[Callable[..., Any], Plain("a function", _is_field)]
+)
+"""A system, or the field of one that has a single chart and no events."""
+
+StateLike: TypeAlias = Mapping[str, Scalar] | Annotated[Numbers, Reals("n")]
+"""The states of a chart: by name, or in order."""
+
+
+def system_of(system: SystemLike, start: Any) -> HybridSystem:
+    """Return a system: of a field (t, q) that of one chart, with the names of the states at the
+    start, `x` for one without a name, or `x0`, `x1`, ...
+
+    **Raises:** `DefinitionError` for a field without a start.
+    """
+    if isinstance(system, HybridSystem):
+        return system
+    if isinstance(start, Mapping):
+        return HybridSystem.from_functions(tuple(start), system)
+    state = start.state if isinstance(start, Guess) else start
+    if np.ndim(state) == 0:
+        raise DefinitionError(
+            "a function is the field of a system, and needs a state to begin with: give one by "
+            "name, {'x': 2.0, 'v': 0.0}, or make the system by "
+            "`hj.HybridSystem.from_functions(('x', 'v'), field)`."
+        )
+    n = np.shape(state)[-1]
+    names = ("x",) if n == 1 else tuple(f"x{i}" for i in range(n))
+    return HybridSystem.from_functions(names, system)
+
+
+def guess_of(s: Structure, state: StateLike, called: str, time: Any = 0.0) -> Guess:
+    """Return the guess that a state means: in the only chart whose states these are.
+
+    **Arguments:** `called`: how sentences begin, as "`start`".
+
+    **Raises:** `DefinitionError` if the states fit no chart, or several.
+    """
+    fitting = [a for a in range(len(s.charts)) if _fits(s, a, state)]
+    if len(fitting) == 1:
+        (a,) = fitting
+        values: Any = state
+        if isinstance(state, Mapping):
+            values = tuple(state[name] for name in s.charts[a].states)
+        return Guess(s.names[a], values, time)
+    if fitting:
+        names = " and ".join(f"'{s.names[a]}'" for a in fitting)
+        raise DefinitionError(
+            f"the charts {names} have such states: say in which one {called} is, as "
+            f"`hj.Guess('{s.names[fitting[0]]}', state)`."
+        )
+    charts = "; ".join(
+        f"'{name}' has {', '.join(chart.states)}"
+        for name, chart in zip(s.names, s.charts, strict=True)
+    )
+    by_name = isinstance(state, Mapping)
+    given = f"the states {', '.join(state)}" if by_name else f"{len(state)} numbers"
+    raise DefinitionError(
+        f"{called} has {given}, which are the states of no chart: {charts}."
+    )
+
+
+def own_guess(system: HybridSystem) -> Guess:
+    """The guess of the model.
+
+    **Raises:** `DefinitionError` if it has none.
+    """
+
+    def of_host(x):
+        # (JAX would compile each operation on numbers of its own.)
+        return np.asarray(x) if isinstance(x, jax.Array) and not x.ndim else x
+
+    guess = jax.tree_util.tree_map(of_host, system).guess()
+    if guess is None:
+        raise DefinitionError(
+            f"{type(system).__name__} has no guess: pass `Guess(chart, state)`."
+        )
+    return guess
+
+
+def _fits(s: Structure, a: int, state: StateLike) -> bool:
+    states = s.charts[a].states
+    if isinstance(state, Mapping):
+        return set(state) == set(map(str, states))
+    return len(state) == len(states)
