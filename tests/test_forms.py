@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import hybridjax as hj
+from hybridjax.errors import DefinitionError
 
 from .conftest import APEX, OUTPUTS
 from .toys import Field, toy
@@ -107,6 +108,13 @@ def test_a_state_by_name_has_derivatives(hopper):
     long = jax.grad(height)(10.0, lambda end: end.state[0])
     assert short == long != 0
 
+    def foot(mass):
+        landed = hj.flow(hopper.replace(m=mass), STATE, "touchdown", within=2.0)
+        return landed["ym"]
+
+    # In stance, the foot has no state: neither a value nor a derivative.
+    assert np.isnan(jax.value_and_grad(foot)(1.0)).all()
+
 
 def test_one_time_needs_no_list(hopper):
     path = hj.simulate(hopper, STATE, 0.5)
@@ -201,15 +209,51 @@ def test_a_field_is_the_system_of_one_chart():
         return (q[1], (1 - q[0] ** 2) * q[1] - q[0])
 
     system = hj.HybridSystem.from_functions(("x", "v"), field)
-    start = {"x": 2.0, "v": 0.0}
+    start = (2.0, 0.0)
     long = hj.find_limit_cycle(system, start)
-    assert_array_equal(hj.find_limit_cycle(field, start).multipliers, long.multipliers)
-    unnamed = hj.find_limit_cycle(field, (2.0, 0.0))
+    unnamed = hj.find_limit_cycle(field, start)
     assert list(unnamed.state) == ["x0", "x1"]
     assert_array_equal(unnamed.multipliers, long.multipliers)
     path = hj.simulate(field, start, 1.0)
     assert_array_equal(path.after, hj.simulate(system, start, 1.0).after)
-    assert hj.flow(field, start, 1.0)["v"] == hj.flow(system, start, 1.0)["v"]
+    assert hj.flow(field, start, 1.0)["x1"] == hj.flow(system, start, 1.0)["v"]
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        # JAX sorts the names of a dictionary, so that their order means nothing.
+        (lambda: hj.flow(lambda t, q: -q, {"x": 1.0, "v": 0.0}, 1.0), "in order"),
+        (lambda: hj.flow(lambda y, t: -y, (1.0,), 1.0), "the time first"),
+        (lambda: hj.flow(lambda t, y, k: -k * y, (1.0,), 1.0), r"not \(t, y, k\)"),
+        (
+            lambda: hj.recordings.Population.from_fits({"S1": 0}, ["S2"]),
+            "fits by name stand for the table|must be",
+        ),
+    ],
+)
+def test_what_has_two_meanings_is_refused(call, message):
+    with pytest.raises(DefinitionError, match=message):
+        call()
+
+
+def test_arguments_that_would_be_dropped_are_refused(hopper, cycle):
+    guess = hj.Guess("flight", (2.0, 0.0, 1.0, 0.0))
+    with pytest.raises(DefinitionError, match="its own time"):
+        hj.simulate(hopper, guess, 0.5, time=0.2)
+    with pytest.raises(DefinitionError, match="the duration alone"):
+        hj.simulate(hopper, guess, 0.5, 1.0)
+    with pytest.raises(DefinitionError, match="stands for both"):
+        hj.continuation(cycle, range=(1.0, 50.0), k=(9.95, 10.05))
+
+    def field(t, q, u, p):
+        return (q[1], p.step * q[1] - p.k * q[0] - q[1] ** 3)
+
+    numbers = {"step": 1.0, "k": 1.0}
+    system = hj.HybridSystem.from_functions(("x", "v"), field, (), numbers)
+    found = hj.find_limit_cycle(system, (1.0, 0.0))
+    with pytest.raises(DefinitionError, match="both an option"):
+        hj.continuation(found, k=(0.9, 1.1), step=0.6)
 
 
 def test_functions_of_a_system_leave_out_last_arguments():

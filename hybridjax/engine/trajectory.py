@@ -32,7 +32,6 @@ from ..systems.quotient import check_symmetry
 from ..systems.start import StateLike, SystemLike, guess_of, own_guess, system_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem, name_of
-from ..systems.transition import SAME_TIME, Scheduled
 from . import kernels
 from .cubic import interpolate
 from .events import INSTANT
@@ -306,7 +305,7 @@ def simulate(
     state: Annotated[Numbers, Reals()] | None = None,
     duration: Duration | None = None,
     *,
-    time: Scalar = 0.0,
+    time: Scalar | None = None,
     input: Callable[[Any], Any] | Annotated[Numbers, Reals()] | None = None,
     settings: Settings | None = None,
     max_steps: StepCount = 100_000,
@@ -320,9 +319,10 @@ def simulate(
         for it.
     - `chart`, `state`, `time`: the start, given by the name of a chart, its states (n,) in order,
         and the time (Default: 0). A guard that is zero or negative there is not an event: a ball
-        that starts below the floor falls on. `findings` of the trajectory list such guards. A
-        `Guess` stands for all three, `hj.simulate(system, guess, duration)`, and so does a state,
-        in order or by name, where only one chart has such states. Default: the model's own guess.
+        that starts below the floor falls on. `findings` of the trajectory list such guards. A start
+        at the time of a scheduled event lies after its reset. A `Guess` stands for all three,
+        `hj.simulate(system, guess, duration)`, and so does a state, in order or by name, where only
+        one chart has such states. Default: the model's own guess.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -399,9 +399,8 @@ def integrate(
         result = Result(int(np.asarray(moved.result)[0]))
     path = recorded(s, begin, tapes, u, result)
     if new_input:
-        guards = begins_beyond(s, begin, u, path.t[-1] - path.t[0])
-        schedules = begins_at_schedule(s, begin, u)
-        path = dataclasses.replace(path, findings=(*guards, *schedules))
+        doubts = tuple(begins_beyond(s, begin, u, path.t[-1] - path.t[0]))
+        path = dataclasses.replace(path, findings=doubts)
     warn_of(path.findings)
     passed = _passed(s, path.t, path.chart, path.before, path.after, path.event, u)
     if passed is not None:
@@ -427,9 +426,20 @@ def _start_of(
     if chart is None and duration is not None:
         chart = own_guess(s.system) if state is None else state
         state = None
+    has_time = isinstance(chart, Guess)
+    if has_time and time is not None:
+        raise DefinitionError(
+            "simulate: a guess has its own time: `hj.Guess(chart, state, time)`, without `time`."
+        )
+    time = 0.0 if time is None else time
     if chart is not None and not isinstance(chart, str | Guess):
         chart = guess_of(s, chart, "the state", time)
     if isinstance(chart, Guess):
+        if state is not None and duration is not None:
+            raise DefinitionError(
+                "simulate: after a guess or a state, give the duration alone: "
+                "`hj.simulate(system, guess, duration)`."
+            )
         # (The duration takes the place of the state.)
         length = state if duration is None else duration
         if length is None or np.ndim(length) or not length > 0:
@@ -532,27 +542,6 @@ def begins_beyond(
                 "cannot happen before the guard has come back."
             )
             yield Finding("beyond a guard", text)
-
-
-def begins_at_schedule(s: Structure, begin: Lanes, u: np.ndarray) -> Iterator[Finding]:
-    """Doubts about a start at the time of a scheduled event whose predicate holds."""
-    a = int(begin.chart[0])
-    t = begin.t
-    for g in s.schedules(a):
-        transition = s.transitions[g]
-        schedule = transition.guard
-        assert isinstance(schedule, Scheduled)
-        _, period = schedule.numbers(t)
-        away = np.abs(schedule.nearest(t) - t)
-        holds = kernels.enabled(s, s.member(g), t, begin.q[: s.dims[a]], u)
-        if away[0] > SAME_TIME * period or not holds.all():
-            continue
-        text = (
-            f"the start lies at a time of the scheduled event '{transition.name}', which does not "
-            "happen there: it happens for the first time one period later. Start a little sooner, "
-            "or after its reset."
-        )
-        yield Finding("at a scheduled event", text)
 
 
 class ReachedGuard(NamedTuple):

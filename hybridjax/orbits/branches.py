@@ -276,6 +276,11 @@ def _parameter_and_range(
     **Raises:** `DefinitionError` where one of them is missing, or there are several.
     """
     given = list(taken_parameters(continuation, cycle, by_name).items())
+    if given and (parameter is None) != (range is None):
+        raise DefinitionError(
+            f"continuation: `{given[0][0]}={given[0][1]}` stands for both `parameter` and `range`: "
+            "leave these out."
+        )
     if parameter is not None and range is not None:
         given.append((parameter, range))
     if len(given) > 1:

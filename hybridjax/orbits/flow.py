@@ -152,10 +152,10 @@ class Flow(Showable, eqx.Module):
         ]
         xp = namespace(self.state)
         places = xp.asarray(index)[self.chart]
-        values = xp.take_along_axis(
-            self.state, xp.maximum(places, 0)[..., None], axis=-1
-        )[..., 0]
-        return xp.where(places < 0, np.nan, values)
+        place = xp.maximum(places, 0)[..., None]
+        values = xp.take_along_axis(self.state, place, axis=-1)[..., 0]
+        lanes = nan_where(xp.atleast_1d(places < 0), xp.atleast_1d(values)[None])
+        return lanes[0].reshape(values.shape)
 
     @property
     def system(self) -> HybridSystem:
@@ -281,8 +281,8 @@ def flow(
     - `settings`: accuracy of the flow. Default: 1e-12, relative to each state in the current step.
     - `max_events`: number of events of which times and states are kept. Default: 16.
     - `max_steps`: largest number of steps. Default: 1024, or that of `settings` if it is larger.
-    - `throw`: raise an error if the flow ends early. Default: True. With False, and inside of JAX's
-      transformations, `result` has the reason, and times and states are NaN.
+    - `throw`: raise an error if the flow ends early. Default: True. With False, and where JAX
+      traces an argument, `result` has the reason, and times and states are NaN.
 
     **Returns:** a `Flow`: `t`, `state` and `chart` at the end, `flow["y"]`; `event_times`,
     `event_index`, `before` and `after` of the first `max_events` events; `result`; and

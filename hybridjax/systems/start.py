@@ -1,5 +1,6 @@
 """What moves, and where it begins, as users give it: a system or its field, a state or a guess."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeAlias
 
@@ -28,25 +29,49 @@ StateLike: TypeAlias = Mapping[str, Scalar] | Annotated[Numbers, Reals("n")]
 
 
 def system_of(system: SystemLike, start: Any) -> HybridSystem:
-    """Return a system: of a field (t, q) that of one chart, with the names of the states at the
-    start, `x` for one without a name, or `x0`, `x1`, ...
+    """Return a system: of a field (t, q) that of one chart, with the states `x0`, `x1`, ..., or `x`
+    for a single one.
 
-    **Raises:** `DefinitionError` for a field without a start.
+    **Raises:** `DefinitionError` for a field without a start, with states by name, or with other
+    arguments.
     """
     if isinstance(system, HybridSystem):
         return system
+    made = "`hj.HybridSystem.from_functions(('x', 'v'), field)`"
     if isinstance(start, Mapping):
-        return HybridSystem.from_functions(tuple(start), system)
+        # (JAX sorts the names of a dictionary that it maps: their order has no meaning.)
+        raise DefinitionError(
+            f"a field takes its states in order: give numbers, (2.0, 0.0), or name them by {made}."
+        )
     state = start.state if isinstance(start, Guess) else start
     if np.ndim(state) == 0:
         raise DefinitionError(
-            "a function is the field of a system, and needs a state to begin with: give one by "
-            "name, {'x': 2.0, 'v': 0.0}, or make the system by "
-            "`hj.HybridSystem.from_functions(('x', 'v'), field)`."
+            "a function is the field of a system, and needs a state to begin with: give its "
+            f"numbers, (2.0, 0.0), or make the system by {made}."
         )
+    _require_arguments(system, made)
     n = np.shape(state)[-1]
     names = ("x",) if n == 1 else tuple(f"x{i}" for i in range(n))
     return HybridSystem.from_functions(names, system)
+
+
+def _require_arguments(field: Callable, made: str) -> None:
+    """**Raises:** `DefinitionError` for a field of other arguments than the time and the state."""
+    try:
+        parameters = inspect.signature(field).parameters.values()
+    except (TypeError, ValueError):  # of functions in C
+        return
+    positional = [x for x in parameters if x.kind <= x.POSITIONAL_OR_KEYWORD]
+    names = [x.name for x in positional if x.default is x.empty]
+    if len(names) > 2:
+        raise DefinitionError(
+            f"a field has the arguments (t, q), and not ({', '.join(names)}): inputs and "
+            f"parameters are those of a system: {made}."
+        )
+    if len(names) == 2 and names[1] in ("t", "time"):
+        raise DefinitionError(
+            f"a field has the arguments (t, q), the time first, and not ({', '.join(names)})."
+        )
 
 
 def guess_of(s: Structure, state: StateLike, called: str, time: Any = 0.0) -> Guess:

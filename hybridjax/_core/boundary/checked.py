@@ -129,11 +129,17 @@ def taken_parameters(
     of a function that makes systems, are not checked.)
 
     **Raises:** `WrongArguments` for a name that is no parameter; `DefinitionError` for a value that
-    does not fit.
+    does not fit, and if an option of the function is called like a parameter.
     """
     kinds: _Kinds = getattr(function, "kinds")  # noqa: B009
     is_known = leads.parameters_of(thing)
     called = function.__name__
+    options = [x for x in is_known if x in kinds.by_name] if given else []
+    if options:
+        raise DefinitionError(
+            f"{called}: `{options[0]}` is both an option of this function and a parameter of the "
+            "system: give parameters otherwise than by keywords."
+        )
     taken = {}
     for name, value in given.items():
         if is_known and name not in is_known:

@@ -121,9 +121,12 @@ def _clock(where: str, headers: dict[str, tuple[str, str]], time: str) -> str:
     if len(clocks) > 1:
         raise FileFormatError(f"{where} has two columns '{time}': rename one.")
     if not clocks:
-        names = ", ".join(name for name, _ in headers.values())
+        names = [name for name, _ in headers.values()]
+        example = names[0] if names else "t"
         raise DefinitionError(
-            f"{where} has no column '{time}': choose `time` from {names}, or add a column of times."
+            f"{where} has no column '{time}': choose `time` from {', '.join(names)}, or add a "
+            "column of times. `hj.read_recording` and `hj.Recording.from_frame` take "
+            f"`time='{example}'`."
         )
     return clocks[0]
 

@@ -132,7 +132,12 @@ class Population(Showable):
         differ.
         """
         if isinstance(fits, Mapping):
-            table = list(fits) if table is None else table
+            if table is not None:
+                raise DefinitionError(
+                    "Population.from_fits: fits by name stand for the table: leave out one of "
+                    "both, or give the fits in a list, in the order of the table's rows."
+                )
+            table = list(fits)
             fits = list(fits.values())
         if table is None:
             raise DefinitionError(
