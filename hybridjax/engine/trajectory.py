@@ -6,7 +6,7 @@ which a reset ends (`_passed`), and pulses (`unresolved.py`). Between steps, sta
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import equinox as eqx
 import jax
@@ -421,44 +421,57 @@ def _start_of(
     """Return the start and the duration, from a chart with a state, from a guess, or from a state
     of the only chart that it fits.
 
-    **Raises:** `DefinitionError` where one of them is missing.
+    **Raises:** `DefinitionError` where one of them is missing, or would be dropped.
     """
-    if chart is None and duration is not None:
-        chart = own_guess(s.system) if state is None else state
-        state = None
-    has_time = isinstance(chart, Guess)
-    if has_time and time is not None:
-        raise DefinitionError(
-            "simulate: a guess has its own time: `hj.Guess(chart, state, time)`, without `time`."
-        )
-    time = 0.0 if time is None else time
-    if chart is not None and not isinstance(chart, str | Guess):
-        chart = guess_of(s, chart, "the state", time)
-    if isinstance(chart, Guess):
+    if isinstance(chart, str):
+        return _start_in_chart(chart, state, duration, time), duration
+    if chart is None:
+        if duration is None:
+            _refuse_missing("duration")
+        start = own_guess(s.system) if state is None else state
+        length = duration
+    else:
         if state is not None and duration is not None:
             raise DefinitionError(
                 "simulate: after a guess or a state, give the duration alone: "
                 "`hj.simulate(system, guess, duration)`."
             )
         # (The duration takes the place of the state.)
+        start = chart
         length = state if duration is None else duration
-        if length is None or np.ndim(length) or not length > 0:
-            raise DefinitionError(
-                "simulate: after a guess or a state, give the duration, a positive number: "
-                "`hj.simulate(system, guess, duration)`."
-            )
-        return chart, length
-    if chart is None or state is None or duration is None:
-        missing = "state" if state is None and chart is not None else "duration"
+    if length is None or np.ndim(length) or not length > 0:
         raise DefinitionError(
-            f"simulate needs `{missing}`: `hj.simulate(system, chart, state, duration)`, or "
+            "simulate: after a guess or a state, give the duration, a positive number: "
             "`hj.simulate(system, guess, duration)`."
         )
+    if not isinstance(start, Guess):
+        return guess_of(s, start, "the state", 0.0 if time is None else time), length
+    if time is not None:
+        raise DefinitionError(
+            "simulate: a guess has its own time: `hj.Guess(chart, state, time)`, without `time`."
+        )
+    return start, length
+
+
+def _start_in_chart(chart: str, state: Any, duration: Any, time: Any) -> Guess:
+    """Return the start in a chart.
+
+    **Raises:** `DefinitionError` without a state or a duration, and for several states.
+    """
+    if state is None or duration is None:
+        _refuse_missing("state" if state is None else "duration")
     if np.ndim(state) != 1:
         raise DefinitionError(
             f"simulate: `state` must be of shape (n,), not of shape {np.shape(state)}."
         )
-    return Guess(chart, state, time), duration
+    return Guess(chart, state, 0.0 if time is None else time)
+
+
+def _refuse_missing(missing: str) -> NoReturn:
+    raise DefinitionError(
+        f"simulate needs `{missing}`: `hj.simulate(system, chart, state, duration)`, or "
+        "`hj.simulate(system, guess, duration)`."
+    )
 
 
 def recorded(
