@@ -752,9 +752,14 @@ def test_events_at_the_start_and_at_the_end():
     up = hj.Guess("main", (0.0, 1.0))
     thrown = hj.flow(ball(), up, 0.1)
     assert thrown.findings == ()
-    # The moment in which the rest of a guard is judged is longer than this throw.
-    long_after = hj.flow(ball(), up, 1e6, throw=False)
-    assert long_after.findings == ()
+    # A throw that lasts a small part of the whole time is no rest.
+    thrown_again = [("floor", lambda t, q: q[0], lambda t, q: (q[0], 1.0))]
+    fountain = hj.HybridSystem.from_functions(
+        ("y", "v"), lambda t, q: (q[1], -9.81), thrown_again
+    )
+    low = hj.flow(fountain, (0.0, 1e-7), 1.0)
+    assert low.findings == ()
+    assert low.count == 5
     rests = hj.Guess("main", (0.0, 0.0))
     for unit in (1.0, 1e-9):
         falls = hj.flow(ball(g=9.81 * unit), rests, 0.1)
