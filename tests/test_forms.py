@@ -311,3 +311,30 @@ def test_a_study_takes_a_table_and_the_options_of_each_recording(
     short = hj.identify_subjects(table, "short", **options)
     assert_array_equal(short.fits[0].multipliers, long.fits[0].multipliers)
     assert list(short.population.table["subject"]) == ["S1"]
+
+
+def test_the_own_guess_of_a_model_holds_under_an_input_of_time():
+    oscillator = hj.models.VanDerPol()
+    plain = hj.simulate(oscillator, duration=0.2)
+    driven = hj.simulate(oscillator, duration=0.2, input=lambda t: 0.0 * t)
+    np.testing.assert_allclose(driven.after[-1], plain.after[-1], rtol=1e-9)
+
+
+def test_tables_with_columns_alone_are_read():
+    """As those of polars, which have no `keys`."""
+
+    class Table:
+        columns = ("time", "x")
+
+        def __getitem__(self, name):
+            return {"time": np.arange(5.0), "x": np.ones(5)}[name]
+
+    assert hj.Recording(Table()).signals == ("x",)
+
+
+def test_a_field_that_is_no_parameter_says_how_to_make_it_one():
+    class Plain(hj.models.VanDerPol):
+        gain: float = 2.0
+
+    with pytest.raises(DefinitionError, match="`gain: hj.Parameter"):
+        hj.sweep(Plain(), gain=[1.0, 2.0])

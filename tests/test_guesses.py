@@ -24,8 +24,7 @@ from hybridjax._core.boundary.guesses.objects import MAKERS, OBJECTS, STEPS
 from hybridjax._core.boundary.guesses.synonyms import ALIKE, WORDS
 from hybridjax._core.showable import Showable, WithMultipliers
 from hybridjax._core.spelling import plain
-from hybridjax.identify.fit import OfFit
-from hybridjax.identify.multiplier_estimate import OfMultiplierFit
+from hybridjax.identify.multiplier_estimate import OfFit
 
 from .conftest import APEX, OUTPUTS
 from .test_names import all_members
@@ -858,5 +857,5 @@ def test_every_result_prints_itself():
     kinds = [Showable]
     for kind in kinds:
         kinds += kind.__subclasses__()
-        if kind not in (Showable, WithMultipliers, OfFit, OfMultiplierFit):
+        if kind not in (Showable, WithMultipliers, OfFit):
             assert kind.__repr__ not in (eqx.Module.__repr__, object.__repr__), kind

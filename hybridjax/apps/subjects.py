@@ -354,17 +354,16 @@ def _rows(table: FilePath | Columns) -> Any:
     subjects.
     """
     if isinstance(table, str | os.PathLike):
-        called = f"the table '{table}'"
+        called = f"the table '{table}', with columns separated by commas,"
         rows = _read(Path(table))
     else:
         called = "`table`"
         columns = {str(name): list(values) for name, values in table.items()}
         rows = package("pandas").DataFrame(columns)
     needed = rows.reindex(columns=["file", "subject"], fill_value="")
-    if rows.empty or not needed.all(axis=None):
-        raise DefinitionError(
-            f"{called} needs 'file' and 'subject' in each row, separated by commas."
-        )
+    is_missing = needed.isna() | (needed == "")
+    if rows.empty or is_missing.any(axis=None):
+        raise DefinitionError(f"{called} needs 'file' and 'subject' in each row.")
     rows = table_of(rows, len(rows))
     names = rows[["subject", *factors_of(rows)]].agg("-".join, axis=1)
     rows.insert(0, "report", [re.sub(r"[^\w.+-]+", "_", name) for name in names])

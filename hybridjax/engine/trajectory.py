@@ -585,7 +585,9 @@ def guards_reached(
     q = lane.q[:n]
     point = np.append(lane.t, q)
     rows, flow = _along(s, a, point, u)
-    begins = _fall(s, a, point + moment * flow, u)
+    begins = np.zeros(len(guards), bool)
+    if moment:
+        begins = _fall(s, a, point + moment * flow, u)
     for g, row, begin in zip(guards, rows, begins, strict=True):
         holds = kernels.enabled(s, s.member(g), lane.t, q, u)
         if not holds.all():

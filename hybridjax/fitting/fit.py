@@ -37,12 +37,14 @@ from .model_fit import Identifiability, ModelFit, ParameterGuess, diagnose
 from .observations import AbstractObservation
 from .problem import (
     DELAYS,
+    FALSE_ALARMS,
     FitProblem,
     Free,
     Parameters,
     TransientProblem,
     descend,
     free_parameters,
+    tail_of,
 )
 from .transients import ObservedTrajectory, require_names
 
@@ -56,10 +58,6 @@ _SPREAD = 0.2
 # residuals, relative to that of the data, is below this. Larger: fits with errors count as perfect.
 # Smaller: perfect fits with rounding errors do not.
 _PERFECT = 1e-12
-# If the data have standard deviations, no further guess is tried once the cost exceeds its mean by
-# less than this many of its standard deviations. (It has a chi-square distribution.) Larger: local
-# minima are accepted. Smaller: global minima are rejected, and all guesses are tried.
-_LIKELY = 4.0
 
 # Cycles at the end of a fit are the same if their periods differ by less than this part. Larger:
 # another cycle is returned with the fit. Smaller: the search is repeated for rounding errors.
@@ -156,7 +154,7 @@ def _fit_cycles(
         if not at_guess and not model.is_beside(start, near):
             cycle = _cycle_at(problem, system, start, near)
         ends.append(_descend(problem, start, cycle, model))
-        if ends[-1].explains(problem.weighted):
+        if ends[-1].explains(problem):
             break
     best = min(ends, key=lambda end: (end.cost, -len(end.residuals)))
     if best.cost == np.inf:
@@ -198,7 +196,7 @@ def _fit_transients(problem: TransientProblem, guesses: int, seed: int) -> Model
         result = Result.OK if converged else Result.NOT_CONVERGED
         cost = float(r @ r) if np.isfinite(J).all() else np.inf
         ends.append(End(start, x, cost, r, J, None, steps, int(result)))
-        if ends[-1].explains(problem.weighted):
+        if ends[-1].explains(problem):
             break
     best = min(ends, key=lambda end: end.cost)
     if not np.isfinite(best.cost):
@@ -352,12 +350,14 @@ class End(NamedTuple):
     steps: int
     result: int
 
-    def explains(self, weighted: bool) -> bool:
+    def explains(self, problem: FitProblem) -> bool:
         """Test whether the fit has converged to a cost that the data explain."""
+        if self.result != Result.OK:
+            return False
+        if not problem.weighted:
+            return self.cost <= _PERFECT * len(self.residuals)
         dof = max(len(self.residuals) - len(self.x), 1)
-        likely = dof + _LIKELY * np.sqrt(2 * dof)
-        goal = likely if weighted else _PERFECT * len(self.residuals)
-        return bool(self.result == Result.OK and self.cost <= goal)
+        return float(tail_of(self.cost, dof, problem.most)) >= FALSE_ALARMS
 
 
 def _cycle_at(

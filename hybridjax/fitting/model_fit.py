@@ -31,7 +31,7 @@ from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
 from ..sections.linearization import linearize
 from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
-from .problem import DELAYS, FitProblem, of_system, tail_of
+from .problem import DELAYS, FALSE_ALARMS, FitProblem, of_system, tail_of
 
 
 # Singular values of the sensitivities below this, or below this part of the largest one, are zero.
@@ -43,10 +43,6 @@ _RANK = 1e-9
 # Smaller: rounding errors of derivatives are printed.
 _CLOSE, _LARGEST_DENOMINATOR = 1e-3, 6
 
-# Probability that the residuals of a right model are called a misfit (up to five times that, where
-# variances were estimated from few realizations). Larger: right models are doubted. Smaller: wrong
-# models whose parameters are a few standard errors off pass.
-FALSE_ALARMS = 1e-3
 # Residuals of this part of what the best identified combination would change are errors of
 # integration. Larger: misfits to precise data pass. Smaller: data without noise are a misfit if
 # their standard deviations are tiny.
@@ -581,7 +577,7 @@ class ModelFit(ParameterFit):
         if not self.weighted or not self.dof or are_exact:
             return
         most = self.problem.most
-        p = float(tail_of(np.asarray(self.cost), self.dof, most))
+        p = float(tail_of(self.cost, self.dof, most))
         if p >= FALSE_ALARMS:
             return
         times = np.sqrt(self.chi2_per_dof / most)

@@ -57,6 +57,10 @@ _DAMPING, _FACTOR = 3e-3, 4.0
 
 # Names of the entries of `ObservedHTF.delay` among the free parameters.
 DELAYS = "input_delay", "output_delay"
+# Probability that the residuals of a right model are called a misfit (up to five times that, where
+# variances were estimated from few realizations). Larger: right models are doubted. Smaller: wrong
+# models whose parameters are a few standard errors off pass.
+FALSE_ALARMS = 1e-3
 # Text between the name of a state and the number of a trajectory, in names of unknown initial
 # states.
 AT_START = " at start "
@@ -236,7 +240,7 @@ def candidate_cycle(
 
 
 def tail_of(
-    cost: Float[np.ndarray, "*n"], dof: float, most: float
+    cost: Float[np.ndarray, "*n"] | float, dof: float, most: float
 ) -> Float[np.ndarray, "*n"]:
     """Return the probability that a right model has a cost as large.
 

@@ -134,38 +134,6 @@ class Fit(WithMultipliers, eqx.Module):
         return print_findings(self.findings, "  ")
 
 
-class OfFit(WithMultipliers):
-    """A result of several steps, which has the multipliers of its `fit` and their uncertainty."""
-
-    if TYPE_CHECKING:
-
-        @property
-        def fit(self) -> Any: ...
-
-    @property
-    def multipliers(self) -> Complex[np.ndarray, " d"]:
-        """Those of the fit."""
-        return self.fit.multipliers
-
-    @property
-    def standard_errors(self) -> Float[np.ndarray, " d"]:
-        """Those of the fit."""
-        return self.fit.standard_errors
-
-    @checked
-    def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
-        """Return bounds of the moduli of the multipliers, as `result.fit.interval` does.
-
-        **Example:**
-
-        ```python
-        low, high = result.interval()[0]
-        print(f"modulus {result.modulus[0]:.3f}, 95 %: {low:.3f} to {high:.3f}")
-        ```
-        """
-        return self.fit.interval(level)
-
-
 class WithCost:
     """A fit that minimizes a sum of squares."""
 

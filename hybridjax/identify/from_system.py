@@ -34,7 +34,7 @@ from ..sections.place import as_placed
 from ..sections.placed import SectionsLike
 from ..systems.system import HybridSystem, OutputNames
 from .htf_estimate import estimate_htf
-from .multiplier_estimate import MultiplierComparison, OfMultiplierFit
+from .multiplier_estimate import MultiplierComparison, OfFit
 from .multipliers import StructuredFit, fit_multipliers
 
 
@@ -50,7 +50,7 @@ _PERIODS = 16
 _REALIZATIONS = 4
 
 
-class ModelIdentification(OfMultiplierFit, eqx.Module):
+class ModelIdentification(OfFit, eqx.Module):
     """The results of `identify_model`, step by step.
 
     **Fields:** `cycle`; `model`, the exact linearization; `design`, `data` of its experiments,

@@ -24,13 +24,13 @@ from .._core.boundary.values import Complexes
 from .._core.findings import Finding
 from .._core.html import multiplier_table, text, unit_circle
 from .._core.results import Result
-from .._core.showable import Showable
+from .._core.showable import Showable, WithMultipliers
 from .._core.text import folded, p_value, rounded, standard_error
 from ..errors import DefinitionError
 from ..linear.multipliers import largest_first
 from .denominator import Covariance, multipliers_of
 from .descent import Coefficients, positive
-from .fit import Fit, OfFit
+from .fit import Fit
 
 
 # Level of the test whether a fit needs one more multiplier. Larger: with process noise, whose
@@ -146,13 +146,34 @@ def compare_multipliers(estimated: Any, true: Any) -> MultiplierComparison:
     )
 
 
-class OfMultiplierFit(OfFit):
-    """A result of several steps whose `fit` compares its multipliers with others."""
+class OfFit(WithMultipliers):
+    """A result of several steps, which has the multipliers of its `fit` and their uncertainty."""
 
     if TYPE_CHECKING:
+        fit: Any
 
-        @property
-        def fit(self) -> "MultiplierFit": ...
+    @property
+    def multipliers(self) -> Complex[np.ndarray, " d"]:
+        """Those of the fit."""
+        return self.fit.multipliers
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, " d"]:
+        """Those of the fit."""
+        return self.fit.standard_errors
+
+    @checked
+    def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "d 2"]:
+        """Return bounds of the moduli of the multipliers, as `result.fit.interval` does.
+
+        **Example:**
+
+        ```python
+        low, high = result.interval()[0]
+        print(f"modulus {result.modulus[0]:.3f}, 95 %: {low:.3f} to {high:.3f}")
+        ```
+        """
+        return self.fit.interval(level)
 
     @checked
     def contains(

@@ -443,13 +443,15 @@ def _about_family(cycle: LimitCycle) -> str:
     outputs = tuple(output.name for output in cycle.system.outputs())
     conserved = _conserved_outputs(cycle, outputs)
     example = {output: float(f"{value:.4g}") for output, value in conserved.items()}
+    first = ""
     if not example:
         example = {"energy": 1.0}
+        first = ", after `outputs()` of the system has an `hj.Output` of this name"
     return (
         f"the return map of {name} has a multiplier of exactly 1 (J - I is singular), so its "
         "cycles form a family: a quantity is conserved, or there is a symmetry. Say which one "
         "is wanted by the value of the quantity (an output of the system), e.g. "
-        f"`conserved={example}`, or take the one nearest to the guess with `throw=False`."
+        f"`conserved={example}`{first}; or take the one nearest to the guess with `throw=False`."
     )
 
 

@@ -33,6 +33,7 @@ from ..engine.lanes import side_by_side
 from ..engine.settings import LIMIT_CYCLE, Settings
 from ..engine.unresolved import has_kinks
 from ..errors import ComputationError, DefinitionError
+from ..systems.check import check_system
 from ..systems.quotient import check_symmetry
 from ..systems.solver import Radau
 from ..systems.start import StateLike, SystemLike, guess_of, system_of
@@ -195,6 +196,7 @@ def find_limit_cycle(
     system = system_of(system, guess)
     section = None if section is None else as_section(section)
     if not isinstance(guess, Guess | LimitCycle | None):
+        check_system(system)
         guess = guess_of(Structure(system), guess, "`guess`")
     if settings.solver == "auto":
         explicit = dataclasses.replace(settings, solver=None)

@@ -356,18 +356,7 @@ def requested(
         system = current(Driven(system, drive))
     s = Structure(system)
     check_schedules(s)
-    if isinstance(start, LimitCycle):
-        start = _at_anchor(start)
-    elif not isinstance(start, Guess | Flow):
-        start = guess_of(s, start, "`start`")
-    if isinstance(start, Flow):
-        _require_start(start, s)
-        lanes = start.lanes
-        many = start.request.many
-        result = start.lane_results
-    else:
-        lanes, many = _lanes_of(s, start)
-        result = namespace(lanes.t).full(lanes.t.shape, Result.OK, np.int32)
+    lanes, many, result = _begun(s, start)
     if is_traced(system, lanes, until, within, u):
         lanes = jax.tree_util.tree_map(jnp.asarray, lanes)
     target, ends_in = _target_of(s, lanes, until, events, within)
@@ -383,6 +372,25 @@ def requested(
         many=many,
         ends_in=ends_in,
     )
+
+
+def _begun(
+    s: Structure, start: Guess | Flow | LimitCycle | StateLike
+) -> tuple[Lanes, bool, Int[Array, " L"]]:
+    """Lanes at the start, whether they are many, and their codes.
+
+    **Raises:** `DefinitionError` for a start that is none of the system.
+    """
+    if isinstance(start, Flow):
+        _require_start(start, s)
+        return start.lanes, start.request.many, start.lane_results
+    if isinstance(start, LimitCycle):
+        start = _at_anchor(start)
+    if not isinstance(start, Guess):
+        start = guess_of(s, start, "`start`")
+    lanes, many = _lanes_of(s, start)
+    result = namespace(lanes.t).full(lanes.t.shape, Result.OK, np.int32)
+    return lanes, many, result
 
 
 def _require_start(start: Flow, s: Structure) -> None:

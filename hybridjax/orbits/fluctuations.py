@@ -394,8 +394,8 @@ def _without_rounding(
     """Covariances with zeros for states that noise does not reach."""
     xp = namespace(covariance)
     variance = xp.diagonal(covariance, axis1=2, axis2=3)
-    in_sizes = variance / sizes[:, None] ** 2
-    random = in_sizes > _ROUNDING**2 * xp.max(in_sizes)
+    relative = variance / sizes[:, None] ** 2
+    random = relative > _ROUNDING**2 * xp.max(relative)
     both = random[..., None] & random[..., None, :]
     return xp.where(both, covariance, 0.0)
 

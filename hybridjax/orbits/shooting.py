@@ -83,8 +83,8 @@ def fixed_point(
     while True:
         step, shift, h = _shift(map, moves, x, target)
         moved = shift[:, 1:]
-        in_sizes = moved / map.scale[moves.chart]
-        length = np.max(np.abs(in_sizes))
+        relative = moved / map.scale[moves.chart]
+        length = np.max(np.abs(relative))
         if not length <= 0.5 * before:
             return otherwise, None
         x = x + step

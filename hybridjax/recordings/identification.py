@@ -29,8 +29,7 @@ from .._core.precision import require_x64
 from .._core.progress import say, working
 from .._core.text import listed
 from ..errors import DefinitionError
-from ..identify.fit import OfFit
-from ..identify.multiplier_estimate import OfMultiplierFit
+from ..identify.multiplier_estimate import OfFit
 from ..identify.series.fit import SeriesFit, fit_series
 from ..identify.series.in_loop import best_order
 from ..identify.series.records import SLOW, PreparedRecords
@@ -65,7 +64,7 @@ MEANING = (
 _MOST_NATURAL = 4
 
 
-class Identification(OfMultiplierFit, eqx.Module):
+class Identification(OfFit, eqx.Module):
     """The results of `identify_recording`, step by step.
 
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `findings`
@@ -131,8 +130,8 @@ class NaturalIdentification(OfFit, eqx.Module):
     **Fields:** `recording`, without the samples that `check_recording` leaves out; `phase`; `data`,
     at the sections; `fit`, the `NaturalMultipliers`; `findings` of all steps.
 
-    It has `multipliers`, `modulus`, `standard_errors` and `interval` of the fit. Functions that
-    take such data take it, too.
+    It has `multipliers`, `modulus`, `standard_errors`, `interval`, `contains` and `compare` of the
+    fit. Functions that take such data take it, too.
     """
 
     _stands_for: ClassVar = ("fit", "data")

@@ -99,8 +99,9 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
 
     @property
     def standard_errors(self) -> Float[np.ndarray, " d"]:
-        """Standard deviation of each modulus over the resamplings."""
-        return _moduli(self.multipliers, self.draws).std(axis=0)
+        """Root of the expected squared distance of each multiplier from the true value, over the
+        resamplings."""
+        return np.sqrt(np.trace(self.multiplier_covariances, axis1=1, axis2=2))
 
     @property
     def multiplier_covariances(self) -> Float[np.ndarray, "d 2 2"]:

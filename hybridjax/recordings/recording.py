@@ -40,8 +40,15 @@ from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
 def _has_columns(value: Any) -> bool:
-    names = ("keys", "column_names")
+    names = ("keys", "column_names", "columns")
     return any(inspect.getattr_static(value, name, None) is not None for name in names)
+
+
+def _names_of_columns(table: Any) -> list[str]:
+    """Return the names of the columns of a table of pyarrow, polars, pandas or a dictionary."""
+    if hasattr(table, "column_names"):
+        return list(table.column_names)
+    return list(table.columns if hasattr(table, "columns") else table.keys())
 
 
 class _Columns(Protocol):
@@ -51,7 +58,7 @@ class _Columns(Protocol):
 NamedColumns: TypeAlias = Annotated[
     _Columns, Plain("a table with named columns", _has_columns)
 ]
-"""A table of pandas or pyarrow, or a dictionary of arrays."""
+"""A table of pandas, polars or pyarrow, or a dictionary of arrays."""
 
 
 @leading_on
@@ -392,8 +399,7 @@ def _table_of(where: str, frame: Any, time: str) -> Table:
             "Recording needs `signals`: `hj.Recording(time, {'name': samples})`, or a table with "
             f"a column `{time}`."
         )
-    keys = getattr(frame, "column_names", None) or frame.keys()
-    columns = Columns({str(key): frame[key] for key in keys})
+    columns = Columns({str(key): frame[key] for key in _names_of_columns(frame)})
     return parse_table(where, columns, time)
 
 

@@ -23,7 +23,6 @@ from ..orbits.checks import check_periodic
 from ..systems.system import (
     HybridSystem,
     describe,
-    name_of,
     parameters_of,
     require_positive,
     unit_of_parameter,
@@ -181,7 +180,7 @@ class Family:
         if not isinstance(system, HybridSystem):
             raise DefinitionError(
                 "`model` must be a system, or a function of parameters that returns one, not a "
-                f"{name_of(system)}."
+                f"{type(system).__name__}."
             )
         require_x64(system)
         check_periodic(system)

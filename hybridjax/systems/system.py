@@ -576,6 +576,9 @@ class Derived(HybridSystem):
     def draw(self, chart, t, q):
         return self.system.draw(chart, t, q)
 
+    def guess(self):
+        return self.system.guess()
+
 
 class Driven(Derived):
     """`system` with a further input that is a function of time. It is added to the piecewise

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
-from hybridjax.fitting import model_fit, problem
+from hybridjax.fitting import problem
 
 from ..conftest import OUTPUTS, no_compilation
 from .conftest import HOPPER, SECTIONS, Oscillator
@@ -132,7 +132,7 @@ def test_a_right_model_is_called_a_misfit_in_one_of_a_thousand_draws():
             errors /= np.sqrt(drawn / (2 * realizations))
         cost = (errors**2).sum(axis=(1, 2))
         p = problem.tail_of(cost, 2.0 * lines, most)
-        alarms = np.mean(p < model_fit.FALSE_ALARMS)
+        alarms = np.mean(p < problem.FALSE_ALARMS)
         assert 2e-4 < alarms < (2e-3 if most == 1 else 5e-3)
 
 

@@ -132,17 +132,17 @@ def taken_parameters(
     does not fit, and if an option of the function is called like a parameter.
     """
     kinds: _Kinds = getattr(function, "kinds")  # noqa: B009
-    is_known = leads.parameters_of(thing)
+    known = leads.parameter_names(thing)
     called = function.__name__
-    options = [x for x in is_known if x in kinds.by_name] if given else []
+    options = [x for x in known if x in kinds.by_name] if given else []
     if options:
         raise DefinitionError(
             f"{called}: `{options[0]}` is both an option of this function and a parameter of the "
-            "system: give parameters otherwise than by keywords."
+            "system: give parameters as a dictionary, or by name and range, not as keywords."
         )
     taken = {}
     for name, value in given.items():
-        if is_known and name not in is_known:
+        if known and name not in known:
             visible = [x for x in kinds.by_name if x not in given]
             raise WrongArguments(leads.about_keyword(called, name, visible, thing))
         try:
@@ -166,8 +166,7 @@ def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable
                     raise WrongArguments(kinds.about_wrong(name, args, kwargs))
                 if is_own and _is_constant(args, kwargs):
                     return _constant(kinds, args, kwargs)
-                args, kwargs = kinds.take(args, kwargs)
-                return function(*args, **kwargs)
+                return kinds.call(args, kwargs)
         except Misfit as misfit:
             raise DefinitionError(
                 f"{name}: `{misfit.path}` {misfit.problem}{misfit.lead}."
@@ -196,15 +195,12 @@ def _is_constant(args: tuple, kwargs: dict[str, Any]) -> bool:
 def _constant(kinds: "_Kinds", args: tuple, kwargs: dict[str, Any]) -> Any:
     """The result of a call that does not depend on what JAX traces. It is computed now and enters
     the program as a constant, so that code which needs its values has them."""
-    function = kinds.function
     try:
         with jax_compat.outside():
-            taken, by_name = kinds.take(args, dict(kwargs))
-            return function(*taken, **by_name)
+            return kinds.call(args, dict(kwargs))
     except jax.errors.UnexpectedTracerError:
         # (A function among the arguments reads a value that JAX traces.)
-        taken, by_name = kinds.take(args, kwargs)
-        return function(*taken, **by_name)
+        return kinds.call(args, kwargs)
 
 
 class _Kinds:
@@ -244,6 +240,11 @@ class _Kinds:
     def of_parameters(self) -> Kind:
         """The kind of further keywords, `**parameters`, which `taken_parameters` checks."""
         return cast(Kind, kind_of(self.hints()["parameters"]))
+
+    def call(self, args: tuple, kwargs: dict[str, Any]) -> Any:
+        """The result of the function, which gets the arguments in one form."""
+        taken, by_name = self.take(args, kwargs)
+        return self.function(*taken, **by_name)
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
         """The arguments in the form in which the function gets them.

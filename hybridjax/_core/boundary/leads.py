@@ -117,7 +117,7 @@ def _about_part(thing: Any, name: str) -> str:
     for other names."""
     if _is_system(thing):
         return ""
-    if name in parameters_of(thing):
+    if name in parameter_names(thing):
         return f": `.system.{name}` is a parameter of its system"
     if name not in _signals(thing):
         return ""
@@ -175,6 +175,11 @@ def _use(name: str | None) -> str | None:
 
 def about_parameter(cls: type, name: str, known: Sequence[str]) -> str:
     """Return the sentence about a parameter that a class has not."""
+    if name in getattr(cls, "__dataclass_fields__", {}):
+        return (
+            f"{cls.__name__}: the field `{name}` is no parameter: declare it by "
+            f"`{name}: hj.Parameter = hj.parameter(...)`."
+        )
     alike = (
         _synonym(name, known),
         spelled_alike(name, known),
@@ -242,7 +247,10 @@ def _in_names_of(given: Sequence[Any], sentence: str) -> str:
     """Return a sentence on a signal 'y' and a parameter 'k' with names of what was given."""
     named = [x for x in given if isinstance(x, str)]
     for thing in given:
-        for letter, names in (("'y'", _signals(thing)), ("'k'", parameters_of(thing))):
+        for letter, names in (
+            ("'y'", _signals(thing)),
+            ("'k'", parameter_names(thing)),
+        ):
             if names:
                 meant = [name for name in named if name in names] or names
                 sentence = sentence.replace(letter, f"'{meant[0]}'")
@@ -267,7 +275,8 @@ def _signals(thing: Any) -> list[str]:
         return []
 
 
-def parameters_of(thing: Any) -> list[str]:
+def parameter_names(thing: Any) -> list[str]:
+    """Return the parameters of a system, or of the system of a result; none of other things."""
     system = getattr(thing, "system", thing)
     if not _is_system(system):
         return []
@@ -306,7 +315,7 @@ def _leads_of_argument(
     own = [function]
     for word in (name, *words.synonyms(name)):
         yield words.lead_of(KEYWORDS, own, word)
-    yield _about_parameter(own, _parameter_like(name, parameters_of(first)))
+    yield _about_parameter(own, _parameter_like(name, parameter_names(first)))
     yield _use(_synonym(name, parameters))
     is_figure = (place_of(function) or "").startswith("hj.plot.")
     owners = [function, "plot", ""] if is_figure else [function, ""]

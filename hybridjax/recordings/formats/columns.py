@@ -126,7 +126,7 @@ def _clock(where: str, headers: dict[str, tuple[str, str]], time: str) -> str:
         raise DefinitionError(
             f"{where} has no column '{time}': choose `time` from {', '.join(names)}, or add a "
             "column of times. `hj.read_recording` and `hj.Recording.from_frame` take "
-            f"`time='{example}'`."
+            f"`time='{example}'`, the command line `--time {example}`."
         )
     return clocks[0]
 
