@@ -42,6 +42,17 @@ def _frame_of_user() -> types.FrameType | None:
     return frame
 
 
+def frames_to_user() -> int:
+    """The number of calls between the function that asks and the user's line (for `stacklevel`)."""
+    user = _frame_of_user()
+    frame = sys._getframe(1)
+    count = 0
+    while frame.f_back is not None and frame is not user:
+        frame = frame.f_back
+        count += 1
+    return count
+
+
 @contextlib.contextmanager
 def public_call() -> Iterator[bool]:
     """A context of a call; its value says whether this is a public call of its own. If not, it is

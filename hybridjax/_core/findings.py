@@ -7,6 +7,7 @@ from typing import Literal
 
 import equinox as eqx
 
+from .call import frames_to_user
 from .exceptions import DefinitionError, FindingWarning
 
 
@@ -47,13 +48,11 @@ def refuse(findings: Iterable[Finding]) -> None:
             raise DefinitionError(finding.text + f" (Found, too: {also})" * bool(also))
 
 
-def warn_of(findings: Iterable[Finding], wrappers: int = 1) -> None:
-    """Emit a `FindingWarning` for each finding, at the line that called the public function.
-
-    **Arguments:** `wrappers`: number of decorators around the function. Default: `checked` alone.
-    """
+def warn_of(findings: Iterable[Finding]) -> None:
+    """Emit a `FindingWarning` for each finding, at the line of the user that called the public
+    function."""
     for finding in findings:
-        warnings.warn(repr(finding), FindingWarning, stacklevel=3 + wrappers)
+        warnings.warn(repr(finding), FindingWarning, stacklevel=1 + frames_to_user())
 
 
 def print_findings(findings: Iterable[Finding], indent: str = "") -> str:

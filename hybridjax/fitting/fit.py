@@ -128,7 +128,7 @@ def fit_model(
     else:
         problem, near = _prepare(system, data, free, guess)
         fit = _fit_cycles(problem, system, near, guesses, seed)
-    warn_of([x for x in fit.findings if x.cause == "misfit"], wrappers=2)
+    warn_of([x for x in fit.findings if x.cause == "misfit"])
     return fit
 
 

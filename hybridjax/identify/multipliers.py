@@ -223,7 +223,7 @@ def fit_multipliers(
     doubts = surplus or order_doubts(fit, higher)
     fit = dataclasses.replace(fit, findings=(*not_converged(result), *doubts))
     if check:
-        warn_of(fit.findings, wrappers=2)
+        warn_of(fit.findings)
     return fit
 
 

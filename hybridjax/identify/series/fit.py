@@ -329,7 +329,7 @@ def fit_series(
     else:
         fit = _fit_in_loop(data, order, extra_lags, references, check)
     if check:
-        warn_of(fit.findings, wrappers=2)
+        warn_of(fit.findings)
     return fit
 
 
