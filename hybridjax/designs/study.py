@@ -65,16 +65,18 @@ class SequentialDesign(Showable, eqx.Module):
     unstable, the first block is repeated with new phases. No prior knowledge is used except the
     number of multipliers.
 
-    *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
-    blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change
-    the likelihood. The estimation error, divided by the estimated standard error, is Gaussian in
-    the limit of many cycles (Wu, Biometrika 72, 1985, for designs that depend on estimates;
-    Anscombe, Proc. Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for
-    stopping as soon as an interval of given width is reached). If a standard error were too small
-    by chance, the study would stop too early. Therefore the larger of two standard errors is used:
-    one from the scatter at the lines that determine the multipliers, the other from the mean noise
-    level of all lines. The study stops when the interval by Student's distribution is as narrow as
-    requested, as in Stein's two stages (Ann. Math. Stat. 16, 1945).
+    *Why intervals are valid.* The final estimate is the maximum-likelihood estimate
+    from all blocks. Inputs and the time of stopping depend on earlier data only, and
+    therefore do not change the likelihood. The estimation error, divided by the
+    estimated standard error, is Gaussian in the limit of many cycles. Wu (Biometrika
+    72, 1985) shows this for designs that depend on estimates. Anscombe (Proc. Camb.
+    Phil. Soc. 48, 1952) and Chow and Robbins (Ann. Math. Stat. 36, 1965) show it for
+    studies that stop as soon as an interval of given width is reached. If a standard
+    error were too small by chance, the study would stop too early. Therefore the larger
+    of two standard errors is used: one from the scatter at the lines that determine the
+    multipliers, the other from the mean noise level of all lines. The study stops when
+    the interval by Student's distribution is as narrow as requested, similar to the
+    two-stage method of Stein (Ann. Math. Stat. 16, 1945).
 
     A study is immutable: `add` returns a new one. It depends on its arguments and blocks only, so
     that it can be reconstructed from stored data.

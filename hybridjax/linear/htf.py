@@ -270,8 +270,8 @@ class HTF(Showable, eqx.Module):
 
         HTFs are multiplied as harmonic matrices, see `feedback`.
 
-        **Raises:** `DefinitionError` as `feedback`, and if the outputs of `other` are not the
-        inputs of this system, by name and unit.
+        **Raises:** `DefinitionError` in the cases of `feedback`, and if the outputs of `other` are
+        not the inputs of this system (by name and unit).
         """
         other = other if isinstance(other, HTF) else other.htf(self.frequencies)
         require_chain("@", other.outputs, self.inputs, self, other)
@@ -280,7 +280,7 @@ class HTF(Showable, eqx.Module):
     def __add__(self, other: "HTF | HasHTF") -> "HTF":
         """The sum of the outputs of two systems with the same inputs.
 
-        **Raises:** `DefinitionError` as `feedback`, and if inputs or outputs differ.
+        **Raises:** `DefinitionError` in the cases of `feedback`, and if inputs or outputs differ.
         """
         other = other if isinstance(other, HTF) else other.htf(self.frequencies)
         require_same("terms of a sum", self, other)
@@ -289,7 +289,7 @@ class HTF(Showable, eqx.Module):
     def inverse(self) -> "HTF":
         """The HTFs from the outputs to the inputs.
 
-        **Raises:** `DefinitionError` as `feedback`, and for different numbers of both.
+        **Raises:** `DefinitionError` in the cases of `feedback`, and for different numbers of both.
         """
         if len(self.inputs) != len(self.outputs):
             raise DefinitionError(

@@ -52,9 +52,9 @@ class AdExNeuron(DrivenNeuron):
     v becomes infinite within a time of C / gL exp(-(v - threshold) / slope), which is 3.5e-4 ms at
     `peak`. (At the paper's peak of 20 mV, this time is too short for double precision.)
 
-    R. Brette, W. Gerstner, Adaptive exponential integrate-and-fire model as an effective
-    description of neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but
-    for `peak`.
+    Equations, and all parameters except `peak`: R. Brette, W. Gerstner, Adaptive
+    exponential integrate-and-fire model as an effective description of neuronal
+    activity, J. Neurophysiology 94, 2005.
     """
 
     input_units = ("pA",)

@@ -333,7 +333,7 @@ def requested(
 ) -> _Request:
     """What is asked for.
 
-    **Raises:** `DefinitionError` as `flow`.
+    **Raises:** `DefinitionError` in the cases of `flow`.
     """
     require_x64(system, start, settings)
     settings = Settings() if settings is None else settings

@@ -232,7 +232,8 @@ class Symmetric(Derived):
         return outputs
 
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
-        """The picture of the original system, which stands at the translation 0 and moves."""
+        """Return the picture of the original system at the translation 0. Its
+        `velocity` is the speed of the translation."""
         whole = self.system.charts()[chart]
         still = dict.fromkeys(self.translation, 0.0)
         time = q["clock"] if self.charts()[chart].clocked else t

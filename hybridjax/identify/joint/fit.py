@@ -80,8 +80,8 @@ class LDTPFit(WithCost, MultiplierFit):
 
     - `model`: the fitted `LDTP`. The coordinates of its states are arbitrary; multipliers and HTFs
       do not depend on them, and have standard errors.
-    - `multipliers` (d,): by decreasing modulus, d the smallest dimension of any x[n].
-      `coefficients` (d,): of their polynomial.
+    - `multipliers` (d,): by decreasing modulus; d is the smallest dimension of any
+      x[n]. `coefficients` (d,): coefficients of the polynomial of the multipliers.
     - `covariance` (d, d): covariance of the coefficients, infinite if the data do not determine all
       of them. `covariance_dof` is infinite if variances were given. `standard_errors`, `contains`
       and `ellipse` follow from it.
@@ -97,12 +97,13 @@ class LDTPFit(WithCost, MultiplierFit):
       noise of the outputs; None for HTFs. `noise` (ny,): standard deviation of the errors one step
       ahead.
     - `findings`: "feedback" if a controller sets the inputs of time series, or may do so (only
-      without `references`); "drift" if a fit to the first 1000 cycles of time series, in which
-      outputs may drift, has other multipliers (outside of each other's confidence regions); "left
-      over" if residuals depend on the inputs; "process noise" or "colored noise" if residuals are
-      correlated in time; "misfit" if residuals of HTFs are larger than their variances, or similar
-      at neighboring frequencies, because the dimensions are too few or the iteration found a local
-      minimum; "order" if one dimension less explains the data; "undetermined"; "no convergence".
+      without `references`); "drift" if a second fit to the first 1000 cycles of time series, in
+      which outputs may drift, has other multipliers (they lie outside of each other's confidence
+      regions); "left over" if residuals depend on the inputs; "process noise" or "colored noise" if
+      residuals are correlated in time; "misfit" if residuals of HTFs are larger than their
+      variances, or similar at neighboring frequencies, because the dimensions are too few or the
+      iteration found a local minimum; "order" if one dimension less explains the data;
+      "undetermined"; "no convergence".
     """
 
     model: LDTP

@@ -191,7 +191,7 @@ class PhaseResponse(PhaseCurve):
 
         **Returns:** `hj.recordings.IntervalForecast`.
 
-        **Raises:** `DefinitionError` as `phase_response`.
+        **Raises:** `DefinitionError` in the cases of `phase_response`.
 
         **Example:**
 
@@ -276,9 +276,10 @@ def phase_response(
       (`hj.Recording.from_frame`).
     - `sections`: the event at which each cycle begins, by its name, or a `Phase` estimated from
       events or crossings.
-    - `input`: the name of the signal that acted; linear between its samples. It must not depend on
-      the rhythm (no feedback). The curve and the rates are those of the rhythm under the mean of
-      this signal in each trial.
+    - `input`: the name of the input signal. It is interpolated linearly between its
+      samples, and must not depend on the rhythm (no feedback). The mean of the signal
+      in each trial counts as a part of the rhythm: the curve and the rates are those of
+      the rhythm under this constant input.
 
     **Returns:** `hj.recordings.PhaseResponse`: `values` and `errors` (P,), in cycles per second and
     unit of the input, at the phases `phase` (P,) in cycles; `rates` (trials,), in cycles per
