@@ -207,8 +207,8 @@ class SequentialDesign(Showable, eqx.Module):
         **Raises:** `DefinitionError` for data of other inputs, outputs or sections, if the data
         show more than `order` multipliers, if they show fewer and determine these to
         `standard_error`, and if the initial transient, relative to the response, exceeds
-        `standard_error` (tested if there are cycles before the window); as `estimate_htf`,
-        `fit_multipliers` and `optimal_design`.
+        `standard_error` (tested if there are cycles before the window). `DefinitionError` in the
+        cases of `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
         require_equal(
             "data and study", "n_sections", data.n_sections, self.first.n_sections

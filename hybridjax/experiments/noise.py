@@ -179,9 +179,9 @@ def add_noise(
 
     - `data`: `ExperimentData`.
     - `std`: standard deviation in units of the outputs: one number, one for each output, or (N, ny)
-      also by section; or
-    - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
-      all samples and OK experiments) and of the noise, in dB, for each output.
+      also by section. Give either `std` or `snr`.
+    - `snr`: signal-to-noise ratio in dB, for each output: 10 log10 of a ratio of variances. The
+      signal is the deviation of the output from the cycle (over all samples and OK experiments).
     - `memory`: correlation time in cycles, as in `ProcessNoise`. Default: 0, white noise.
     - `seed`: seed of the random numbers. Default: 0.
 

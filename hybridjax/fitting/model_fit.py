@@ -161,11 +161,11 @@ class ParameterGuess(NamedTuple):
 
 
 class ParameterComparison(Showable, eqx.Module):
-    """Fitted parameters beside true ones, or those of another fit. Printing it shows a table.
+    """Fitted parameters compared with true values or with another fit. Printing it shows a table.
 
     **Fields:** `names`; `true` and `estimated` (p,); `error` (p,), their difference, and
-    `standard_errors` (p,), those of the difference; `p_value`: probability of differences as large
-    as these if all are equal; `with_fit`: whether `true` are those of another fit.
+    `standard_errors` (p,) of the difference. `p_value`: probability of differences at least as
+    large if all true differences are zero. `with_fit`: whether `true` is another fit.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -529,8 +529,8 @@ class ModelFit(ParameterFit):
 
         For the true values it has a chi square distribution with `identifiability.rank` degrees of
         freedom (Wilks 1938). Unlike $e^T J^T J e$ with the errors e of the values, it does not
-        depend on the parametrization, and follows curved regions. Where the data have no standard
-        deviations, or estimated ones, it is in units that the residuals show.
+        depend on the parametrization, and follows curved regions. If the data have no standard
+        deviations, or estimated ones, its unit is estimated from the residuals.
 
         **Arguments:** `true`: values by name, or a system whose other parameters are those of the
         fit.

@@ -67,11 +67,11 @@ def estimate_htf(
       "auto".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
-    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
-      those that the controller sets, and the HTFs are those of the plant, from these inputs to the
-      outputs. Noise that the controller feeds back does not bias them (`identify/instrument.py`).
-      References that excite f must also excite f + m for all integers m, up to N/2. Default: None;
-      there is no controller.
+    - `references`: names of the inputs that enter a control loop from outside. The controller sets
+      the other inputs. The HTFs belong to the plant, from the other inputs to the outputs. Noise
+      that the controller feeds back does not bias them (`identify/instrument.py`). References that
+      excite f must also excite f + m for all integers m, up to N/2. Default: None; there is no
+      controller.
 
     **Returns:** `hj.linear.HTF`: `H` (M, F, ny, nu), complex, in units of the output per unit of
     the input; `frequencies` (F,), ascending, in cycles per period; `variance`, of the shape of `H`.

@@ -331,9 +331,9 @@ class HTF(Showable, eqx.Module):
         $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. If the variance was
         estimated from few experiments, discs are larger (`VarianceDof.quantile`). The probability
         is exact for complex Gaussian errors. With at least four realizations it is nearly exact for
-        errors of equal moduli, as from the distortion by a single product of two cosines. The true
-        value is the best linear approximation for inputs of the kind that was applied, not the
-        response to infinitely small ones.
+        errors of equal moduli, such as the distortion by a single product of two cosines. The true
+        value is the best linear approximation for inputs like those of the experiment, not the
+        response to infinitely small inputs.
 
         **Raises:** `DefinitionError` without `variance`.
         """

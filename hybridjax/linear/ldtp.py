@@ -337,8 +337,8 @@ class LDTP(WithMultipliers, eqx.Module):
         and unit, or a static gain, (nu, ny) or (N, nu, ny). F acts at the sections: u[n] answers
         the y[n] that is measured before u[n] acts.
 
-        **Returns:** the system from r, which has the names of u, to y. Its states are those of P,
-        then those of F; its `multipliers` are those of the loop.
+        **Returns:** the system from r, which has the names of u, to y. Its states are the states of
+        P, followed by the states of F. Its `multipliers` are the multipliers of the loop.
 
         **Raises:** `DefinitionError` if names, units or numbers of sections differ, or where direct
         feed-through of both makes a loop without a response.

@@ -98,8 +98,8 @@ class IzhikevichNeuron(DrivenNeuron):
     States: potential `v` of the membrane, and its recovery `w` (u in the paper). The current I(t) =
     current + amplitude cos(2 pi t / T) causes one spike in each period.
 
-    E. M. Izhikevich, Simple model of spiking neurons, IEEE Trans. Neural Networks 14, 2003, whose
-    parameters for regular spiking these are.
+    Equations, and parameters for regular spiking: E. M. Izhikevich, Simple model of spiking
+    neurons, IEEE Trans. Neural Networks 14, 2003.
     """
 
     input_units = ("mV/ms",)

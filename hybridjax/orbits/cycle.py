@@ -284,8 +284,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
-        belong to conserved quantities."""
+        """True if all multipliers lie inside the unit circle. Multipliers of exactly 1 that belong
+        to conserved quantities do not count."""
         inside = np.abs(self.multipliers) < 1
         free = len(inside) - len(self.conserved)
         return bool(np.sum(inside) == free)

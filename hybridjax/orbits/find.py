@@ -158,9 +158,9 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
         takes 60 s). It does not help if the cycle is unstable. Default: 0.
     - `max_period`: for autonomous systems, the time after which the search for a return to the
-        section is given up. Default: 1000 times the time scale of the states, at the guess or at
-        the end of this search, where it is longer. In charts with an implicit method, the time
-        scale is that of the slowest mode.
+        section is given up. Default: 1000 times the time scale of the states. It is computed at the
+        guess and at the end of this search, and the longer one is taken. In charts with an implicit
+        method, the time scale is that of the slowest mode.
     - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
         relative to these. Default: each state's largest modulus on the cycle, so that results do
         not depend on units (under a JAX transformation, those of the guess).

@@ -372,7 +372,8 @@ class SectionList(AbstractSections):
     """Sections one by one. Where they are placed on a cycle, the first one stays section 0, and the
     others are sorted by the order in which the cycle meets them.
 
-    **Fields:** `items`: a list of `Crossing` and `AtEvent`, which the name of an event stands for.
+    **Fields:** `items`: a list of `Crossing` and `AtEvent`. The name of an event can replace its
+    `AtEvent`.
 
     **Example:**
 

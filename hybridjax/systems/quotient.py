@@ -43,8 +43,8 @@ class Symmetric(Derived):
 
     Of two charts that are mirror images of each other, one is left out. A transition into it leads
     into the other chart, and mirrors the state. A step is therefore a cycle, and two steps are a
-    stride. With S the symmetry and P the map of a step of `system`, the multipliers of a step are
-    those of S P, and those of the stride, (S P)^2, are their squares.
+    stride. Let S be the symmetry and P the map of a step of `system`. A step has the multipliers of
+    S P. A stride has those of (S P)^2, which are their squares.
 
     **Arguments:**
 

@@ -285,11 +285,11 @@ def fit_ldtp(
       inputs (not with "innovations"). `findings`, and warnings (`FindingWarning`), report if one
       dimension less explains the data as well, if residuals of time series depend on the inputs,
       and if drift explains the multipliers. Default: True.
-    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
-      those that the controller sets. The fit is that of the plant, from these inputs to the
-      outputs, with innovations; the plant may be unstable. The fit is consistent if D is zero at
-      sections where the controller responds without delay, which the response of the outputs to the
-      reference shows. If the reference was not recorded, pass noise="innovations". Default: None.
+    - `references`: names of the inputs that enter a control loop from outside. The controller sets
+      the other inputs. The fit is a model of the plant, from the other inputs to the outputs, with
+      innovations. The plant may be unstable. The fit is consistent if D is zero at sections where
+      the controller responds without delay, which the response of the outputs to the reference
+      shows. If the reference was not recorded, pass noise="innovations". Default: None.
 
     Without a reference, D is fixed to zero in three cases: outputs do not depend on inputs at the
     same section; inputs depend on earlier residuals; or the past determines the inputs (few

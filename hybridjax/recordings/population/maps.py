@@ -127,7 +127,8 @@ class PopulationMaps:
       stacked by `np.stack`.
     - `axes`: coordinates by name, in the order of the grid. `unit` of the values. Default: none.
 
-    **Raises:** `DefinitionError` for shapes that do not fit together, and as `Population`.
+    **Raises:** `DefinitionError` for shapes that do not fit together, and in the cases of
+    `Population`.
 
     **Example:**
 

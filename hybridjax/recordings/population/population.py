@@ -120,13 +120,13 @@ class Population(Showable):
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
-        The names of the subjects alone, `from_fits(fits, ["S1", "S2"])`, or fits by name,
-        `from_fits({"S1": fit, "S2": other})`, stand for a table.
+        Instead of a table, pass the names of the subjects, `from_fits(fits, ["S1", "S2"])`, or fits
+        by name, `from_fits({"S1": fit, "S2": other})`.
 
-        Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, its
-        `decay` (the rate -ln(modulus) per stride: half of a deviation is left after
-        ln(2) / decay strides; negative if it grows), and the coefficients `c1`, `c2`, ... of the
-        characteristic polynomial (missing in fits of lower order).
+        Quantities are the `modulus` and the `angle` (in rad, missing if real) of the leading
+        multiplier, its `decay`, and the coefficients `c1`, `c2`, ... of the characteristic
+        polynomial (missing in fits of lower order). `decay` is the rate -ln(modulus) per stride:
+        half of a deviation is left after ln(2) / decay strides. It is negative if deviations grow.
 
         **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
         differ.
