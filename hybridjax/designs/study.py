@@ -83,10 +83,10 @@ class SequentialDesign(Showable, eqx.Module):
 
     **Arguments:**
 
-    - `first`: the first block; its lines, periods and power are those of all blocks. One input.
+    - `first`: the first block, with one input. All blocks have its lines, periods and power.
     - `order`: the number of multipliers.
-    - `standard_error`: the study stops when each multiplier of `goal` has this standard error (for
-      `"position"`, the root of the expected squared distance from the true multiplier).
+    - `standard_error`: the study stops when each multiplier of `goal` has this standard error. For
+      `"position"`, it is the root of the expected squared distance from the true multiplier.
     - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
     - `limit`: as in `optimal_design`, relative to `first`. Default: rms of the input as in `first`.
     - `outputs`: names of outputs that will be recorded and that `limit` names. Default: none.

@@ -77,11 +77,11 @@ def estimate_htf(
     the input; `frequencies` (F,), ascending, in cycles per period; `variance`, of the shape of `H`.
     At a frequency that was measured in one realization only, `variance` is computed from the mean
     residual of the other frequencies. If this is so at most frequencies, `variance` is that of
-    noise (None without `repeats`, and fits then use `power` as weights).
+    noise. Without `repeats`, it is then None, and fits use `power` as weights.
 
-    **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
-    one experiment disturb each other (the message lists the pair); for too few periods or
-    realizations for the requested variance; or for parts that do not belong together.
+    **Raises:** `DefinitionError` if nothing was excited or no experiment is left, or if two lines
+    of one experiment disturb each other (the message lists the pair). `DefinitionError` for too few
+    periods or realizations for the requested variance; or for parts that do not belong together.
 
     **Example:**
 

@@ -163,7 +163,7 @@ def find_limit_cycle(
         method, the time scale is that of the slowest mode.
     - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
         relative to these. Default: each state's largest modulus on the cycle, so that results do
-        not depend on units (under a JAX transformation, those of the guess).
+        not depend on units. Under a JAX transformation, the default is the `scale` of the guess.
     - `settings`: accuracy of the integration (default: 1e-12), largest number of steps (also of
         `linearize`), and `solver`; "auto" uses an implicit method in the charts that are stiff on
         the cycle.

@@ -109,7 +109,7 @@ class Coupling(Showable, eqx.Module):
     r"""Mean effect of a weak push, by its lead $\psi$ in cycles (see `Responses.coupling`).
 
     The rate of the phase is $f_0 + \varepsilon \Gamma(\psi)$ in cycles per time under a push of the
-    strength $\varepsilon$. Calls return $\Gamma$ at some leads.
+    strength $\varepsilon$. `coupling(lead)` returns $\Gamma$ at one or several leads $\psi$.
 
     **Fields:** `coefficients` (n,): those of $e^{2 \pi i n \psi}$ in $\Gamma$, n = 0, 1, ...
     """

@@ -68,11 +68,11 @@ class Symmetric(Derived):
     Inputs act on the state in the charts that are kept, which is the mirrored one in every second
     step. With `half_period`, they act on the mirrored state in every second half of a cycle.
 
-    **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle or a
-    trajectory is computed, if a function does not have the symmetry; it names the function. A
-    derivative with respect to a parameter that breaks the symmetry (the stiffness of one leg)
-    raises an error, and so does, inside of `jit`, a system that is made there with such a
-    parameter.
+    **Raises:** `DefinitionError` if charts or states do not fit together. When a cycle or a
+    trajectory is computed, `DefinitionError` if a function does not have the symmetry; the message
+    names the function. A derivative with respect to a parameter that breaks the symmetry (the
+    stiffness of one leg) raises an error. A system that is made inside of `jit` with such a
+    parameter raises an error, too.
     """
 
     pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)

@@ -242,7 +242,8 @@ class SeriesFit(MultiplierFit):
     def predicted(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "S T N ny"]:
-        """Return the outputs from the inputs, and from the starts and drift that fit best."""
+        """Return the outputs that follow from the inputs, with the initial conditions and the drift
+        that fit best."""
         N, R, ny, _ = self.numerators.shape
         T = grid.u.shape[1]
         v = divide_by_chi(self.coefficients, grid.u)
