@@ -61,7 +61,7 @@ def to_xarray(
     - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, frequency,
       output, input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment,
       sample, input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
-      `output_unit` beside them. Of a `ModelFit` these are the numbers, without its system.
+      `output_unit` beside them. For a `ModelFit`, the dataset has its numbers, without its system.
     - `Recording`: a variable for each signal, along `sample`, with the coordinates `time` and
       `trial`; events along `occurrence`.
     - `SectionData`: the same at sections, and the `average_cycle`.

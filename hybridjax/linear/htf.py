@@ -115,8 +115,8 @@ class HTF(Showable, eqx.Module):
     - `frequencies` (F,): input frequencies, cycles per period.
     - `H` (M, F, ny, nu): complex values.
     - `harmonics` (M,): ascending integers, the `m` of `H`'s first axis.
-    - `n_sections`: `N`, the number of sections (samples) in one period; 0 in continuous time, where
-        n / N is time in periods, and every integer m a harmonic of its own.
+    - `n_sections`: `N`, the number of sections (samples) in one period. It is 0 in continuous time,
+        where n / N is time in periods and every integer m is a harmonic.
     - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`.
     - `source`: a label, "exact" or "estimate".
     - `variance` (M, F, ny, nu): E|dH|^2 of the complex error dH of estimates, which is circular
@@ -302,8 +302,8 @@ class HTF(Showable, eqx.Module):
 
         HTFs are matrices at each class of lines f + integers, $H(f)[a, b] = H_{a-b}(f + b)$, since
         every input frequency of the class answers every other one. Variances are propagated to
-        first order, from errors that are independent and circular; where one operand has none, it
-        is taken as exact if its source is "exact".
+        first order, from errors that are independent and circular. An operand without variances
+        counts as exact if its source is "exact".
 
         **Arguments:** `controller`: HTFs with the same frequencies, or anything with a method
         `htf`: an `LDTP`, a fit.

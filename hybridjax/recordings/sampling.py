@@ -74,9 +74,9 @@ def sample_sections(
     that is not smooth.
 
     Splines bridge gaps up to the mean time between sections, but not less than three samples of a
-    signal. In longer gaps, values are NaN: an output at a section in a gap of its own samples, or
-    of those of the angle that is the phase; an input if the interval from its section to the next
-    touches a gap of its own samples.
+    signal. In longer gaps, values are NaN. An output is NaN if its section lies in a gap of its own
+    samples, or of the samples of the angle that is the phase. An input is NaN if the interval from
+    its section to the next touches a gap of its own samples.
 
     **Arguments:**
 

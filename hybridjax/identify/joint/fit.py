@@ -291,11 +291,11 @@ def fit_ldtp(
       the controller responds without delay, which the response of the outputs to the reference
       shows. If the reference was not recorded, pass noise="innovations". Default: None.
 
-    Without a reference, D is fixed to zero in three cases: outputs do not depend on inputs at the
-    same section; inputs depend on earlier residuals; or the past determines the inputs (few
-    excited frequencies) and a fit with D is not better (at 5 %). Otherwise D is fitted, and
-    a finding reports that a controller could cause the dependence. If the data do not determine
-    D, the printed fit reports this.
+    Without a reference, D is fixed to zero in three cases. First, outputs do not depend on inputs
+    at the same section. Second, inputs depend on earlier residuals. Third, the past determines the
+    inputs (few excited frequencies), and a fit with D is not better (at 5 %). Otherwise D is
+    fitted, and a finding reports that a controller could cause the dependence. If the data do not
+    determine D, the printed fit reports this.
 
     **Returns:** `hj.identify.LDTPFit`: `model`, the fitted `hj.linear.LDTP`; `multipliers` (d,),
     without unit, with `standard_errors` (d,) and `covariance` (d, d), that of their coefficients;
