@@ -55,7 +55,7 @@ def input_and_output_names(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """`names` of nu inputs and of ny outputs.
 
-    **Raises:** `DefinitionError` as `names`, and for an output that is an input.
+    **Raises:** `DefinitionError` in the cases of `names`, and for an output that is an input.
     """
     u = names("inputs", inputs, nu)
     y = names("outputs", outputs, ny)

@@ -207,8 +207,8 @@ def identify_subjects(
 
     - `table`: CSV file with the columns `file` (relative to the table) and `subject`; `condition`
       and `group`, if there are any; other columns (age, speed) are kept in
-      `SubjectStudy.population.table`. Or such columns, as a data frame or by name, with files
-      relative to the folder of this process.
+      `SubjectStudy.population.table`. It may also be a data frame, or a dictionary of columns;
+      files are then relative to the folder of this process.
     - `folder`: folder of the results, which is made if it does not exist.
     - `identify`: function from a `Recording` to the result of `identify_recording`. Default:
       `identify_recording` itself, with all further keywords, `options`, such as `sections`,

@@ -16,7 +16,7 @@ from ..scale.sweeps import sweep
 def run(options: Any) -> int:
     """Sweep, draw the maps beside the store, and print a summary, from the options of the command.
 
-    **Raises:** `DefinitionError` for a file without such a model, and as `sweep`.
+    **Raises:** `DefinitionError` for a file without such a model, and in the cases of `sweep`.
     """
     values = {
         name: np.linspace(low, high, count) for name, low, high, count in options.values

@@ -33,12 +33,12 @@ from ..systems.system import OutputNames
 def to_lti(model: LDTP) -> LDTP:
     r"""Return the same system with one sample for each period.
 
-    Sample k of the result has the state at section 0 of period k; the inputs `u[n]`, held from
-    section n of that period on; and the outputs `y[n]` at section n of the *same* period, before
+    Sample k of the result has the state at section 0 of period k, and the inputs `u[n]`, held from
+    section n of that period on. Its outputs are `y[n]` at section n of the *same* period, before
     `u[n]` acts except through the feed-through D. So the outputs of a period depend on the inputs
-    of the same period: the new D holds the responses within a period (zero for later inputs), C the
-    map from section 0 to each section, B the map from each input to section 0 of the next period,
-    and A is the monodromy matrix. Names are `u[0]`, ..., `u[N-1]` for an input `u`; all inputs of
+    of the same period. The new A is the monodromy matrix. B is the map from each input to section 0
+    of the next period, C the map from section 0 to each section. D holds the responses within a
+    period (zero for later inputs). Names are `u[0]`, ..., `u[N-1]` for an input `u`; all inputs of
     section 0 come first, then the inputs of section 1.
 
     Its response G at $z = e^{2 \pi i f}$, f in cycles per period, holds all harmonics:

@@ -61,7 +61,7 @@ def to_xarray(
     - Objects that `hj.save` writes: a variable for each array, such as `H` (harmonic, frequency,
       output, input) of an `HTF`, `A` (section, next_state, state) of an `LDTP`, `u` (experiment,
       sample, input) of `ExperimentData`. Inputs and outputs are coordinates, with `input_unit` and
-      `output_unit` beside them. Of a `ModelFit` these are the numbers, without its system.
+      `output_unit` beside them. For a `ModelFit`, the dataset has its numbers, without its system.
     - `Recording`: a variable for each signal, along `sample`, with the coordinates `time` and
       `trial`; events along `occurrence`.
     - `SectionData`: the same at sections, and the `average_cycle`.
@@ -102,9 +102,10 @@ def to_xarray(
 def from_xarray(dataset: Any) -> Saved:
     """Return the object from which `to_xarray` made a dataset, with the same numbers bit by bit.
 
-    **Arguments:** `dataset`: an `xarray.Dataset` that `to_xarray` has made of an object that
-    `hj.save` can write, or a part of it. A part may select harmonics, frequencies, experiments and
-    signals. Of the samples it must hold consecutive ones, of which the first is at section 0.
+    **Arguments:** `dataset`: an `xarray.Dataset` from `to_xarray`, made of an object
+    that `hj.save` can write. It may also be a part of such a dataset. A part may select
+    harmonics, frequencies, experiments and signals. Its samples must be consecutive,
+    with the first at section 0.
 
     **Returns:** an object of the type that `to_xarray` was given.
 

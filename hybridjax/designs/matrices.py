@@ -142,7 +142,7 @@ def response_criterion(
 ) -> LinearCriterion:
     """Return the criterion of transfer functions in a band.
 
-    **Raises:** `DefinitionError` for a band beyond N/2, and as `ldtp_matrices`.
+    **Raises:** `DefinitionError` for a band beyond N/2, and in the cases of `ldtp_matrices`.
     """
     N = cosines.n_sections
     low, high = goal.frequencies

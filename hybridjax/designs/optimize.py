@@ -69,21 +69,22 @@ class OptimalDesign(Showable, eqx.Module):
     - `names` (g,) of the quantities of interest; `variances` (g,) with `design`, `usual_variances`
       with `usual`.
     - `criterion` and `usual_criterion`: the minimized function, in units of a variance.
-    - `certificate`: a number e: no design within the limits needs fewer cycles than 1/e of this
-      one's, so that e is 1 at the optimum. It is the largest sum of sensitivities of any design
-      within the limits, relative to that of this one (with one limit, the largest sensitivity of a
-      line per unit of the limit). If peaks are limited, e may be larger at the optimum: peaks of
-      other designs are taken to be no larger than rms values. If distortion is limited, e compares
-      only with designs whose convex bound of the distortion is no larger than the limit, or than
-      that of this design.
-    - `frequencies` (K,) and `channels` (K,) of all cosines; `power` and `usual_power` (K,),
-      the mean square of each over all experiments; `sensitivity` (K,), the decrease of the
-      criterion by more power in a cosine, divided by its price: 1 where the optimum has power, less
-      elsewhere.
-    - `limited`: names of the limits that are reached: of rms values by their signals, of rates,
-      peaks and distortions.
-    - `rms`, `usual_rms`: predicted rms values of all signals, by name; of `distortion of y` where
-      it is limited, expected for random phases (with a limited peak, for the optimized phases).
+    - `certificate`: a number e, which is 1 at the optimum. No design within the limits needs fewer
+      cycles than 1/e of the cycles of this design. e is the largest sum of sensitivities of any
+      design within the limits, relative to the sum of this design. With one limit, it is the
+      largest sensitivity of a line per unit of the limit. If peaks are limited, e may be larger at
+      the optimum, because peaks of other designs are assumed to be no larger than rms values. If
+      distortion is limited, e compares only with designs whose convex bound of the distortion is no
+      larger than the limit, or no larger than the bound of this design.
+    - `frequencies` (K,) and `channels` (K,) of all cosines. `power` and `usual_power` (K,): the
+      mean square of each over all experiments. `sensitivity` (K,): the decrease of the criterion by
+      more power in a cosine, divided by the price of this power. It is 1 where the optimum has
+      power, and less elsewhere.
+    - `limited`: names of the limits that are reached. A limit of an rms value has the name of its
+      signal; there are also limits of rates, peaks and distortions.
+    - `rms`, `usual_rms`: predicted rms values of all signals, by name. If distortion is limited,
+      `distortion of y` is its rms, expected for random phases (with a limited peak, for the
+      optimized phases).
 
     Functions that take a design take it, too.
     """
@@ -289,9 +290,9 @@ def optimal_design(
     - `goal`: `"multipliers"`, or one of `hj.designs`: `MultiplierGoal`, `ParameterGoal`,
       `ResponseGoal`. Default: `"multipliers"`.
     - `limit`: largest rms values over all experiments, by name of inputs or outputs (deviations
-      from the cycle): `{"u": 0.01}`; `"input"` or `"output"`: their rms values in `design`; or
-      `hj.designs.Limits`, which also limits peaks, rates, cycles and distortion.
-      Default: `"input"`.
+      from the cycle), as in `{"u": 0.01}`. `"input"` or `"output"` takes the rms values of
+      `design`. `hj.designs.Limits` also limits peaks, rates, cycles and distortion. Default:
+      `"input"`.
     - `noise`: standard deviation of the white noise of each measured output, by name, or one number
       for all outputs; or, by name, a function of the frequency of the output (0 to N/2 cycles per
       period). Its value is the standard deviation of white noise with the spectral density at this

@@ -65,26 +65,28 @@ class SequentialDesign(Showable, eqx.Module):
     unstable, the first block is repeated with new phases. No prior knowledge is used except the
     number of multipliers.
 
-    *Why intervals are valid.* The final estimate is the maximum-likelihood estimate from all
-    blocks. Inputs and the time of stopping depend on earlier data only, and therefore do not change
-    the likelihood. The estimation error, divided by the estimated standard error, is Gaussian in
-    the limit of many cycles (Wu, Biometrika 72, 1985, for designs that depend on estimates;
-    Anscombe, Proc. Camb. Phil. Soc. 48, 1952, and Chow and Robbins, Ann. Math. Stat. 36, 1965, for
-    stopping as soon as an interval of given width is reached). If a standard error were too small
-    by chance, the study would stop too early. Therefore the larger of two standard errors is used:
-    one from the scatter at the lines that determine the multipliers, the other from the mean noise
-    level of all lines. The study stops when the interval by Student's distribution is as narrow as
-    requested, as in Stein's two stages (Ann. Math. Stat. 16, 1945).
+    *Why intervals are valid.* The final estimate is the maximum-likelihood estimate
+    from all blocks. Inputs and the time of stopping depend on earlier data only, and
+    therefore do not change the likelihood. The estimation error, divided by the
+    estimated standard error, is Gaussian in the limit of many cycles. Wu (Biometrika
+    72, 1985) shows this for designs that depend on estimates. Anscombe (Proc. Camb.
+    Phil. Soc. 48, 1952) and Chow and Robbins (Ann. Math. Stat. 36, 1965) show it for
+    studies that stop as soon as an interval of given width is reached. If a standard
+    error were too small by chance, the study would stop too early. Therefore the larger
+    of two standard errors is used: one from the scatter at the lines that determine the
+    multipliers, the other from the mean noise level of all lines. The study stops when
+    the interval by Student's distribution is as narrow as requested, similar to the
+    two-stage method of Stein (Ann. Math. Stat. 16, 1945).
 
     A study is immutable: `add` returns a new one. It depends on its arguments and blocks only, so
     that it can be reconstructed from stored data.
 
     **Arguments:**
 
-    - `first`: the first block; its lines, periods and power are those of all blocks. One input.
+    - `first`: the first block, with one input. All blocks have its lines, periods and power.
     - `order`: the number of multipliers.
-    - `standard_error`: the study stops when each multiplier of `goal` has this standard error (for
-      `"position"`, the root of the expected squared distance from the true multiplier).
+    - `standard_error`: the study stops when each multiplier of `goal` has this standard error. For
+      `"position"`, it is the root of the expected squared distance from the true multiplier.
     - `goal`: the multipliers of interest, estimated by `fit_multipliers`. Default: all.
     - `limit`: as in `optimal_design`, relative to `first`. Default: rms of the input as in `first`.
     - `outputs`: names of outputs that will be recorded and that `limit` names. Default: none.
@@ -205,8 +207,8 @@ class SequentialDesign(Showable, eqx.Module):
         **Raises:** `DefinitionError` for data of other inputs, outputs or sections, if the data
         show more than `order` multipliers, if they show fewer and determine these to
         `standard_error`, and if the initial transient, relative to the response, exceeds
-        `standard_error` (tested if there are cycles before the window); as `estimate_htf`,
-        `fit_multipliers` and `optimal_design`.
+        `standard_error` (tested if there are cycles before the window). `DefinitionError` in the
+        cases of `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
         require_equal(
             "data and study", "n_sections", data.n_sections, self.first.n_sections

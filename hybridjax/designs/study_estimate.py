@@ -57,7 +57,8 @@ class Block(NamedTuple):
 
 
 def block_of(data: ExperimentData, goal: MultiplierGoal, repeats: int) -> Block:
-    """**Raises:** `DefinitionError` as `estimate_htf`, and if no experiment ran to its end."""
+    """**Raises:** `DefinitionError` in the cases of `estimate_htf`, and if no experiment ran to the
+    end."""
     data.require_ok()
     require_deviations(data.records)
     each = []

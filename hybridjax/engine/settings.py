@@ -108,7 +108,7 @@ class Settings(eqx.Module):
         self.solver = solver if isinstance(solver, str) else solvers(solver)
 
     def filled(self, accuracy: float) -> "Settings":
-        """Settings with this accuracy where none is given."""
+        """Return the settings, with this accuracy for each tolerance that is None."""
         rtol, atol = (accuracy if x is None else x for x in (self.rtol, self.atol))
         return Settings(rtol, atol, self.max_steps, self.scale)
 

@@ -173,8 +173,8 @@ class Trajectory(Showable, eqx.Module):
     def at(
         self, t: Annotated[Numbers, Reals("p")] | Scalar
     ) -> tuple[Int[np.ndarray, "*p"], Float[np.ndarray, "*p d"]]:
-        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. At one
-        time they are without that axis; at an event they are those after it.
+        """Charts (p,) and states (p, d) at times (p,), by the cubic Hermite interpolant. For a
+        single time they have no axis p. At the time of an event, they are those after the event.
 
         **Raises:** `DefinitionError` for times before its begin or after its end.
         """
@@ -315,14 +315,14 @@ def simulate(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`; with a state, a field (t, q) of one chart without events stands
-        for it.
+    - `system`: a `HybridSystem`. If the start is a state, it may also be the vector field (t, q) of
+        a single chart without events.
     - `chart`, `state`, `time`: the start, given by the name of a chart, its states (n,) in order,
         and the time (Default: 0). A guard that is zero or negative there is not an event: a ball
         that starts below the floor falls on. `findings` of the trajectory list such guards. A start
-        at the time of a scheduled event lies after its reset. A `Guess` stands for all three,
-        `hj.simulate(system, guess, duration)`, and so does a state, in order or by name, where only
-        one chart has such states. Default: the model's own guess.
+        at the time of a scheduled event lies after its reset. A `Guess` can replace all three:
+        `hj.simulate(system, guess, duration)`. If only one chart has such states, a state suffices:
+        `(1.0, 0.0)` or `{"y": 1.0, "v": 0.0}`. Default: the model's own guess.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of

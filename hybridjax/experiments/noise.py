@@ -28,14 +28,14 @@ from .design.design import DISCARD, Design, require_inputs
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProcessNoise:
-    r"""A random input, held from section to section, that is added to the excitation and is not
-    recorded: at section n of the experiment $\sigma_{n \bmod N} z_n$, where z is a first-order
-    autoregressive series (AR(1)) of variance 1.
+    r"""A random input that is added to the excitation and is not recorded. It is held
+    from section to section. At section n of the experiment, it is $\sigma_{n \bmod N}
+    z_n$, where z is a first-order autoregressive series (AR(1)) of variance 1.
 
     **Fields:**
 
-    - `std`: standard deviation, in units of the inputs; one number, or N of them, by section (the
-      noise is then cyclostationary).
+    - `std`: standard deviation, in units of the inputs. It is one number, or N numbers,
+      one for each section; with N numbers the noise is cyclostationary.
     - `seed`: seed of the random numbers. Default: 0.
     - `memory`: correlation time in cycles. The correlation of noise k sections apart is
       $e^{-k / (N \tau)}$. The noise is stationary from the start of an experiment on. Default: 0,
@@ -179,9 +179,9 @@ def add_noise(
 
     - `data`: `ExperimentData`.
     - `std`: standard deviation in units of the outputs: one number, one for each output, or (N, ny)
-      also by section; or
-    - `snr`: 10 log10 of the ratio of the variances of the outputs' deviations from the cycle (over
-      all samples and OK experiments) and of the noise, in dB, for each output.
+      also by section. Give either `std` or `snr`.
+    - `snr`: signal-to-noise ratio in dB, for each output: 10 log10 of a ratio of variances. The
+      signal is the deviation of the output from the cycle (over all samples and OK experiments).
     - `memory`: correlation time in cycles, as in `ProcessNoise`. Default: 0, white noise.
     - `seed`: seed of the random numbers. Default: 0.
 

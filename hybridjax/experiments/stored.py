@@ -225,10 +225,10 @@ def run_experiments(
         every section, relative to their characteristic magnitudes (`LimitCycle.scale`).
         `data.error` estimates the error of each experiment. Default: 1e-9.
     - `execution`: batches and threads.
-    - `feedback`: a controller F that is at work during the experiments: the input is
-        $u = r - F y$ with r the `design` and y the deviations of the `outputs` from the cycle,
-        measured before u acts. An `LDTP` from the outputs to the inputs, by name, or a static
-        gain, (nu, ny) or (N, nu, ny). It may stabilize an unstable cycle. Default: None.
+    - `feedback`: a controller F that acts during the experiments. The input is $u = r - F y$, where
+        r is the `design` and y are the deviations of the `outputs` from the cycle, measured before
+        u acts. F is an `LDTP` from the outputs to the inputs, by name, or a static gain, (nu, ny)
+        or (N, nu, ny). It may stabilize an unstable cycle. Default: None.
     - `chunk`: number of experiments per chunk. Default: all experiments at once; 640 in a store.
     - `store`: a folder, or an address for fsspec ("s3://bucket/records.zarr"), of a Zarr group. It
         holds the experiments of one call only. The `design` may then be an array that lies on disk
@@ -241,10 +241,11 @@ def run_experiments(
     `StoredExperiments`. `data.summary()` lists failures with their causes. With `feedback` its
     inputs are u, then r, named "r", or "r0", "r1", ... where there are several.
 
-    **Raises:** `DefinitionError` for arguments that do not fit together, if the store holds other
-    experiments (with the difference) or cannot be written, or if the workers of the client cannot
-    run them; `ComputationError` for an unstable cycle or loop, because experiments would diverge
-    from it, if a steady start is not found, or if the cluster is lost.
+    **Raises:** `DefinitionError` for arguments that do not fit together. `DefinitionError` if the
+    store cannot be written or holds other experiments (the message gives the difference), or if the
+    workers of the client cannot run the experiments. `ComputationError` for an unstable cycle or
+    loop, because experiments would diverge from it. `ComputationError` if a steady start is not
+    found, or if the cluster is lost.
 
     **Example:**
 

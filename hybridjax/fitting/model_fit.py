@@ -52,10 +52,11 @@ _INTEGRATED = 1e-7
 class Identifiability(Showable, eqx.Module):
     r"""The combinations of parameters that the data identify, near given values.
 
-    With the sensitivities $S_{ij} = p_j\,\partial r_i/\partial p_j$ of the weighted residuals to
-    relative changes, changes in the null space of S do not change the data (to first order): for a
-    row w of `unseen`, $p_j \to p_j\, c^{w_j}$ for all j leaves them as they are (for a parameter
-    that is zero, or has bounds on both sides or none: $p_j \to p_j + s_j w_j \log c$).
+    S holds the sensitivities $S_{ij} = p_j\,\partial r_i/\partial p_j$ of the weighted
+    residuals to relative changes. Changes in the null space of S do not change the data
+    (to first order). If w is a row of `unseen`, the change $p_j \to p_j\, c^{w_j}$ of
+    all parameters does not change the data. For a parameter that is zero, or that has
+    bounds on both sides or no bound, the change is $p_j \to p_j + s_j w_j \log c$.
 
     **Fields:**
 
@@ -160,11 +161,11 @@ class ParameterGuess(NamedTuple):
 
 
 class ParameterComparison(Showable, eqx.Module):
-    """Fitted parameters beside true ones, or those of another fit. Printing it shows a table.
+    """Fitted parameters compared with true values or with another fit. Printing it shows a table.
 
     **Fields:** `names`; `true` and `estimated` (p,); `error` (p,), their difference, and
-    `standard_errors` (p,), those of the difference; `p_value`: probability of differences as large
-    as these if all are equal; `with_fit`: whether `true` are those of another fit.
+    `standard_errors` (p,) of the difference. `p_value`: probability of differences at least as
+    large if all true differences are zero. `with_fit`: whether `true` is another fit.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -406,16 +407,19 @@ class ModelFit(ParameterFit):
 
     **Fields** beside those of every `Fit` (`noise` is None):
 
-    - `system`, and `model`: with the fitted parameters. `cycle`: its limit cycle, which has the
-        `multipliers`; None for a fit to trajectories (`ObservedTrajectory`), which has none.
+    - `system`, and `model`: with the fitted parameters. `cycle`: the limit cycle of
+        `system`, which has the `multipliers`. It is None for a fit to trajectories
+        (`ObservedTrajectory`).
     - `names`, `values` (p,): the free parameters.
-    - `covariance` (p, p): of the values, $(J^T J)^+$ with the Jacobian J of the residuals in units
-        of their standard deviations (estimated from the residuals where the data have none); zero
-        along combinations that the data do not identify; NaN without standard deviations if
-        `dof` is 0.
+    - `covariance` (p, p): covariance of the values, $(J^T J)^+$ with the Jacobian J of
+        the residuals in units of their standard deviations. Where the data have no
+        standard deviations, they are estimated from the residuals; if `dof` is 0, the
+        covariance is then NaN. It is zero along combinations that the data do not
+        identify.
     - `residuals` (r,): weighted, those of all observations one after the other.
-    - `cost`: sum of their squares. `dof`: r less the number of identified combinations; the
-        expected cost where all data have standard deviations.
+    - `cost`: sum of the squares of the residuals. `dof`: r less the number of
+        identified combinations. It is the expected cost if all data have standard
+        deviations.
     - `identifiability`: the combinations of parameters that the data identify.
     - `guesses`: for each guess, in order, its `values` (p,), the `fitted` ones (p,), their `cost`,
         the number of evaluations, `steps`, and the `result`. `result`: code of the best one.
@@ -525,8 +529,8 @@ class ModelFit(ParameterFit):
 
         For the true values it has a chi square distribution with `identifiability.rank` degrees of
         freedom (Wilks 1938). Unlike $e^T J^T J e$ with the errors e of the values, it does not
-        depend on the parametrization, and follows curved regions. Where the data have no standard
-        deviations, or estimated ones, it is in units that the residuals show.
+        depend on the parametrization, and follows curved regions. If the data have no standard
+        deviations, or estimated ones, its unit is estimated from the residuals.
 
         **Arguments:** `true`: values by name, or a system whose other parameters are those of the
         fit.

@@ -253,8 +253,8 @@ class ObservedCycle(AbstractObservation):
     only their differences matter.
 
     Residuals are in units of the standard deviations, if these are given. Otherwise they are
-    relative: those of values to the rms of the output, that of the period to the measured period,
-    those of times to the period of the guess.
+    relative. Residuals of values are divided by the rms of the output, that of the period by the
+    measured period, and residuals of times by the period of the guess.
 
     **Example:**
 

@@ -37,28 +37,29 @@ def cramer_rao(
 ) -> MultiplierEstimate:
     r"""Return the Cramer-Rao bound of the multipliers of a known model.
 
-    The errors of the HTFs are independent, circular and Gaussian. The bound limits the accuracy
-    that an experiment can reach, before the experiment.
+    The errors of the HTFs are independent, circular and Gaussian. The bound is the best
+    accuracy that an experiment can reach. It is computed before the experiment.
 
     **Arguments:**
 
     - `model`: the true system. `htf`: frequencies, harmonics and `variance` of the experiment; its
       H is not used.
-    - `estimator`: the estimation function for which the bound holds. For "fit_multipliers" they are
-      the multipliers and all numerators: the bound is the inverse of $J^T J$, where J is the
-      derivative of the HTFs in units of their standard deviations, projected orthogonally to all
-      changes of the numerators. For "fit_ldtp" they are the matrices A[n], B[n], C[n] (and D[n], if
-      the model has any), of the minimal part of the model. The square of the ratio of the two
-      standard errors tells how many times more data "fit_multipliers" needs than "fit_ldtp".
-      Default: "fit_multipliers".
+    - `estimator`: the estimation function for which the bound holds. The unknowns of
+      "fit_multipliers" are the multipliers and all numerators. The bound is then the
+      inverse of $J^T J$, where J is the derivative of the HTFs in units of their
+      standard deviations, projected orthogonally to all changes of the numerators. The
+      unknowns of "fit_ldtp" are the matrices A[n], B[n], C[n] (and D[n], if the model
+      has any) of the minimal part of the model. The square of the ratio of the two
+      standard errors is the factor by which "fit_multipliers" needs more data than
+      "fit_ldtp". Default: "fit_multipliers".
     - `extra_lags`: degree of the numerators beyond d N, of "fit_multipliers". Default: N.
 
     **Returns:** `hj.identify.MultiplierEstimate`: the true `multipliers` (d,) with the smallest
     `covariance` (d, d) of an unbiased estimate. `standard_errors` (d,) are bounds of rms errors.
     For "fit_ldtp", d is the smallest dimension of the state of the minimal model.
 
-    **Raises:** `DefinitionError` if the two do not fit together, `htf` has no variances, or too
-    few frequencies to find the multipliers at all.
+    **Raises:** `DefinitionError` if `model` and `htf` do not fit together, or if `htf`
+    has no variances or too few frequencies to find the multipliers.
 
     **Example:**
 

@@ -101,8 +101,9 @@ class Fit(WithMultipliers, eqx.Module):
     def interval(self, level: Probability = 0.95) -> Float[np.ndarray, "k 2"]:
         """Return bounds that hold each true value with this probability, to first order.
 
-        The values are the moduli of the multipliers, or the parameters. Bounds are infinite where
-        the data do not determine a value.
+        The values are the moduli of the multipliers. For a fit of physical parameters,
+        they are the parameters. Bounds are infinite where the data do not determine a
+        value.
 
         **Example:**
 

@@ -112,8 +112,8 @@ def identify_model(
 
     **Returns:** `ModelIdentification`, with the results of all steps.
 
-    **Raises:** `DefinitionError` for a system without inputs, and as the functions of the steps;
-    `ComputationError` for an unstable cycle.
+    **Raises:** `DefinitionError` for a system without inputs, and in the cases of the functions
+    that make the steps; `ComputationError` for an unstable cycle.
 
     **Example:**
 

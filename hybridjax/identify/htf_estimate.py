@@ -67,21 +67,21 @@ def estimate_htf(
       "auto".
     - `threshold`: a line counts as excited above this part of the largest |U| of its experiment.
       Raise it where the recorded input is noisy. Default: 1e-6.
-    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
-      those that the controller sets, and the HTFs are those of the plant, from these inputs to the
-      outputs. Noise that the controller feeds back does not bias them (`identify/instrument.py`).
-      References that excite f must also excite f + m for all integers m, up to N/2. Default: None;
-      there is no controller.
+    - `references`: names of the inputs that enter a control loop from outside. The controller sets
+      the other inputs. The HTFs belong to the plant, from the other inputs to the outputs. Noise
+      that the controller feeds back does not bias them (`identify/instrument.py`). References that
+      excite f must also excite f + m for all integers m, up to N/2. Default: None; there is no
+      controller.
 
     **Returns:** `hj.linear.HTF`: `H` (M, F, ny, nu), complex, in units of the output per unit of
     the input; `frequencies` (F,), ascending, in cycles per period; `variance`, of the shape of `H`.
     At a frequency that was measured in one realization only, `variance` is computed from the mean
     residual of the other frequencies. If this is so at most frequencies, `variance` is that of
-    noise (None without `repeats`, and fits then use `power` as weights).
+    noise. Without `repeats`, it is then None, and fits use `power` as weights.
 
-    **Raises:** `DefinitionError` if nothing was excited or no experiment is left; if two lines of
-    one experiment disturb each other (the message lists the pair); for too few periods or
-    realizations for the requested variance; or for parts that do not belong together.
+    **Raises:** `DefinitionError` if nothing was excited or no experiment is left, or if two lines
+    of one experiment disturb each other (the message lists the pair). `DefinitionError` for too few
+    periods or realizations for the requested variance; or for parts that do not belong together.
 
     **Example:**
 

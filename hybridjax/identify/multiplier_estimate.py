@@ -83,9 +83,9 @@ class MultiplierComparison(Showable, eqx.Module):
 
     - `true` and `estimated` (k,); `error` (k,), their distance, and `max_error`, the largest.
     - `outputs` (k,): the outputs' names; empty where all outputs have the same multipliers.
-    - `p_value`: probability of distances as large as these if all are equal; None where the
-      covariance is unknown.
-    - `with_fit`: whether `true` are those of another fit, and `error` the distance from them.
+    - `p_value`: probability of distances at least as large if all true distances are zero. It is
+      None if the covariance is unknown.
+    - `with_fit`: whether `true` is another fit, and `error` the distance from its multipliers.
     """
 
     true: Complex[np.ndarray, " k"]

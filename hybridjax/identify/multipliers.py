@@ -64,12 +64,14 @@ class StructuredFit(WithCost, FitWithoutModel):
     - `cost`: sum of squares of the misfit in units of the errors' standard deviations; its expected
       value is `dof`. Without variances the unit is estimated from the misfit, and the two are
       equal.
-    - `numerators` (M, degree + 1, ny, nu): coefficients of B_m, by rising power of z^-1. In a
-      narrow band of frequencies many give the same fit; these are the smallest.
+    - `numerators` (M, degree + 1, ny, nu): coefficients of B_m, by rising power of
+      z^-1. In a narrow band of frequencies, many numerators give the same fit;
+      `numerators` are the smallest of them.
     - `harmonics` (M,), `n_sections`, `inputs`, `outputs`: names and numbers of the fitted HTFs.
-    - `findings`: "order" if one more multiplier, or two, contradict those of this fit (they lie
-      outside of each other's confidence regions), or if the data do not support so many;
-      "undetermined"; "no convergence". Higher orders are not tried without `check`.
+    - `findings`: "order" if fits with one or two more multipliers contradict this fit
+      (multipliers lie outside of each other's confidence regions), or if the data do
+      not support so many; "undetermined"; "no convergence". Higher orders are not tried
+      without `check`.
     """
 
     residual: Float[np.ndarray, " ny"]
@@ -127,12 +129,12 @@ def fit_multipliers(
 
     **Arguments:**
 
-    - `htf`: exact or estimated; `htf.select` chooses harmonics. Without variances, weights are
-      estimated from the residuals of each output, whose spectrum is modeled as white noise plus
-      noise filtered by the system; frequencies are weighted by the power of their inputs
-      (`htf.power`).
-    - `order`: d, the number of non-zero multipliers, or an `LDTP` model whose rank it is.
-      `select_order` helps to find it.
+    - `htf`: exact or estimated; `htf.select` chooses harmonics. Without variances,
+      weights are estimated from the residuals of each output. The model of their
+      spectrum is white noise plus noise filtered by the system. Frequencies are then
+      also weighted by the power of their inputs (`htf.power`).
+    - `order`: d, the number of non-zero multipliers, or an `LDTP` model that has this
+      number. `select_order` helps to find it.
     - `extra_lags`: degree of the numerators beyond d N. Default: N.
     - `covariance`: source of the covariance. `"residuals"`: the residuals at each frequency. This
       remains valid if the errors of different harmonics are dependent (process noise, distortion)
@@ -279,18 +281,21 @@ class OrderSelection(Showable, eqx.Module):
     **Fields**, one entry for each order 0, 1, ..., the largest tried:
 
     - `orders`.
-    - `strength`: the singular value that an order beyond this one would have to explain, in units
-      of the noise: 1 where only noise is left. `deviation`: its distance from 1 in standard
-      deviations, and `threshold` the value that noise alone exceeds in 1 % of cases.
+    - `strength`: the singular value that an order beyond this one would have to
+      explain, in units of the noise: 1 where only noise is left. `deviation` is the
+      distance of `strength` from 1 in standard deviations. `threshold` is the value
+      that noise alone exceeds in 1 % of cases.
     - `cost`, `dof`: the misfit of the best fit, and its expected value (somewhat larger where
       the variances were estimated).
-    - `mdl`: Rissanen's criterion, which penalizes each real coefficient, those of the numerators
-      too, by the logarithm of the number of data. The smallest is best.
+    - `mdl`: Rissanen's criterion. It penalizes each real coefficient, including those
+      of the numerators, by the logarithm of the number of data. The smallest value is
+      best.
     - `by_rank`, `by_mdl`: the order that each criterion selects.
-    - `order`: `by_rank` for HTFs with variances and for exact ones, otherwise `by_mdl`. With strong
-      noise, `mdl` selects too few multipliers, because a longer denominator adds many coefficients
-      of numerators, which it penalizes; in exact HTFs it counts rounding as data. Where there are
-      no variances, small errors that are not random do not mislead it.
+    - `order`: `by_rank` for HTFs with variances and for exact ones, otherwise `by_mdl`.
+      With strong noise, `mdl` selects too few multipliers, because a longer denominator
+      adds many coefficients of numerators. In exact HTFs, `mdl` counts rounding as
+      data. If there are no variances, small errors that are not random do not mislead
+      `mdl`.
     """
 
     orders: Int[np.ndarray, " k"]

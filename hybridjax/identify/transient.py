@@ -67,12 +67,12 @@ class TransientFit(Showable, eqx.Module):
 def remove_transient(data: ExperimentData, order: Order | None = None) -> TransientFit:
     """Fit the decay of the initial condition's response, and subtract it.
 
-    No model is needed. The input must repeat after P periods in the whole record, and the record
-    must be at least one period longer than P: the first, in which zero multipliers vanish, is cut
-    off. If it is longer by several (20, say), the decay is separated from everything that repeats
-    after P periods, distortion included, and any design will do. With fewer, it is separated only
-    from the response at excited lines, so that the design must leave out half of them
-    (`multisine(lines="odd")`).
+    No model is needed. The input must repeat after P periods in the whole record. The record must
+    be at least one period longer than P, because the first period, in which zero multipliers
+    vanish, is cut off. If the record is several periods longer than P (such as 20), the decay is
+    separated from everything that repeats after P periods, including distortion, and any design can
+    be used. If it is shorter, the decay is separated only from the response at excited lines, so
+    that the design must leave out half of the lines (`multisine(lines="odd")`).
 
     **Arguments:**
 

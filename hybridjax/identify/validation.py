@@ -81,8 +81,9 @@ class Validation(Showable, eqx.Module):
       $100\,(1 - \|y - \hat y\| / \|y - \bar y\|)$: 100 is perfect, 0 as good as the mean.
     - `noise` (ny,): rms of the residuals.
     - `no_better` (ny,): p-value of the hypothesis that the model predicts a cycle no better than
-      the mean of all other cycles does: that squared residuals are on average no smaller than
-      squared deviations from this mean. Where it is large, the model explains nothing.
+      the mean of all other cycles. Under this hypothesis, squared residuals are on average no
+      smaller than squared deviations from this mean. If the p-value is large, the model explains
+      nothing.
     - `whiteness` (ny,): p-value of the hypothesis that the residuals are white: they are not where
       it is small (process noise, or dynamics that the model lacks).
     - `independence` (ny,): p-value of the hypothesis that the residuals do not depend on the
@@ -247,8 +248,8 @@ def validate(
     **Arguments:**
 
     - `model`: identified or exact. A fit of `fit_series` or `fit_multipliers` is simulated as it
-      is; the latter should have all harmonics. Of a fit of `fit_model` the linearization at the
-      sections of its observations is simulated.
+      is; a fit of `fit_multipliers` should have all harmonics. For a fit of `fit_model`, the
+      linearization at the sections of its observations is simulated.
     - `data`: data as for `fit_series`, preferably other data than those of the fit, with which a
       model always agrees too well.
     - `start`: "free" estimates the initial state of each record from the record; "cycle" takes it
@@ -262,9 +263,10 @@ def validate(
     in units of the output, and p-values, `whiteness` and `independence`. Printing it gives a
     report.
 
-    **Raises:** `DefinitionError` if model and data have different N or names, there are too few
-    cycles, all records are too short to be compared or for so many lags, or a plant that is
-    unstable outside of its loop or grows without bound, unless it is a fit of `fit_ldtp`.
+    **Raises:** `DefinitionError` if model and data have different N or names, if there are too few
+    cycles, or if all records are too short to be compared or for so many lags. `DefinitionError`
+    for a plant that is unstable outside of its loop or grows without bound, unless it is a fit of
+    `fit_ldtp`.
 
     **Example:**
 

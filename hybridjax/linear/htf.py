@@ -115,8 +115,8 @@ class HTF(Showable, eqx.Module):
     - `frequencies` (F,): input frequencies, cycles per period.
     - `H` (M, F, ny, nu): complex values.
     - `harmonics` (M,): ascending integers, the `m` of `H`'s first axis.
-    - `n_sections`: `N`, the number of sections (samples) in one period; 0 in continuous time, where
-        n / N is time in periods, and every integer m a harmonic of its own.
+    - `n_sections`: `N`, the number of sections (samples) in one period. It is 0 in continuous time,
+        where n / N is time in periods and every integer m is a harmonic.
     - `inputs`, `outputs`: names, or units by name, as in `{"yM": "m"}`.
     - `source`: a label, "exact" or "estimate".
     - `variance` (M, F, ny, nu): E|dH|^2 of the complex error dH of estimates, which is circular
@@ -270,8 +270,8 @@ class HTF(Showable, eqx.Module):
 
         HTFs are multiplied as harmonic matrices, see `feedback`.
 
-        **Raises:** `DefinitionError` as `feedback`, and if the outputs of `other` are not the
-        inputs of this system, by name and unit.
+        **Raises:** `DefinitionError` in the cases of `feedback`, and if the outputs of `other` are
+        not the inputs of this system (by name and unit).
         """
         other = other if isinstance(other, HTF) else other.htf(self.frequencies)
         require_chain("@", other.outputs, self.inputs, self, other)
@@ -280,7 +280,7 @@ class HTF(Showable, eqx.Module):
     def __add__(self, other: "HTF | HasHTF") -> "HTF":
         """The sum of the outputs of two systems with the same inputs.
 
-        **Raises:** `DefinitionError` as `feedback`, and if inputs or outputs differ.
+        **Raises:** `DefinitionError` in the cases of `feedback`, and if inputs or outputs differ.
         """
         other = other if isinstance(other, HTF) else other.htf(self.frequencies)
         require_same("terms of a sum", self, other)
@@ -289,7 +289,7 @@ class HTF(Showable, eqx.Module):
     def inverse(self) -> "HTF":
         """The HTFs from the outputs to the inputs.
 
-        **Raises:** `DefinitionError` as `feedback`, and for different numbers of both.
+        **Raises:** `DefinitionError` in the cases of `feedback`, and for different numbers of both.
         """
         if len(self.inputs) != len(self.outputs):
             raise DefinitionError(
@@ -302,8 +302,8 @@ class HTF(Showable, eqx.Module):
 
         HTFs are matrices at each class of lines f + integers, $H(f)[a, b] = H_{a-b}(f + b)$, since
         every input frequency of the class answers every other one. Variances are propagated to
-        first order, from errors that are independent and circular; where one operand has none, it
-        is taken as exact if its source is "exact".
+        first order, from errors that are independent and circular. An operand without variances
+        counts as exact if its source is "exact".
 
         **Arguments:** `controller`: HTFs with the same frequencies, or anything with a method
         `htf`: an `LDTP`, a fit.
@@ -331,9 +331,9 @@ class HTF(Showable, eqx.Module):
         $r^2 = v \ln(1 / (1 - level))$ for a variance $v$ that is known. If the variance was
         estimated from few experiments, discs are larger (`VarianceDof.quantile`). The probability
         is exact for complex Gaussian errors. With at least four realizations it is nearly exact for
-        errors of equal moduli, as from the distortion by a single product of two cosines. The true
-        value is the best linear approximation for inputs of the kind that was applied, not the
-        response to infinitely small ones.
+        errors of equal moduli, such as the distortion by a single product of two cosines. The true
+        value is the best linear approximation for inputs like those of the experiment, not the
+        response to infinitely small inputs.
 
         **Raises:** `DefinitionError` without `variance`.
         """

@@ -337,8 +337,8 @@ class LDTP(WithMultipliers, eqx.Module):
         and unit, or a static gain, (nu, ny) or (N, nu, ny). F acts at the sections: u[n] answers
         the y[n] that is measured before u[n] acts.
 
-        **Returns:** the system from r, which has the names of u, to y. Its states are those of P,
-        then those of F; its `multipliers` are those of the loop.
+        **Returns:** the system from r, which has the names of u, to y. Its states are the states of
+        P, followed by the states of F. Its `multipliers` are the multipliers of the loop.
 
         **Raises:** `DefinitionError` if names, units or numbers of sections differ, or where direct
         feed-through of both makes a loop without a response.
@@ -385,10 +385,12 @@ class LDTP(WithMultipliers, eqx.Module):
     def characteristic_polynomial(self) -> Float[Array, " coefficients"]:
         r"""Coefficients $1, c_1, \ldots, c_d$ of $\det(\lambda I - \Phi)$, highest power first.
 
-        The same at every section, smooth also where multipliers meet, and differentiable, unlike
-        `multipliers`. It forms the product of the factors, and coefficients beyond the number of
-        non-zero multipliers are zero up to rounding. Inside of JAX transformations more of these
-        may follow than outside: count coefficients from the first, not from the last.
+        The coefficients are the same at every section. Unlike `multipliers`, they are
+        differentiable, and they are smooth even where multipliers meet. They are
+        computed from the product of the factors. Coefficients beyond the number of
+        non-zero multipliers are zero up to rounding. Inside of JAX transformations,
+        more of these zeros may follow than outside: count coefficients from the first,
+        not from the last.
         """
         return time_response.characteristic_polynomial(self.monodromy())
 

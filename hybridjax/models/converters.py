@@ -15,8 +15,8 @@ class BuckConverter(HybridSystem):
     conduction), and the voltage `ramp` with which the amplified error is compared. A scheduled
     event resets the ramp once a period. Input `u` is added to the reference voltage.
 
-    E. Fossas, G. Olivar, Study of chaos in the buck converter, IEEE Trans. Circuits and Systems I
-    43, 1996, whose parameters these are.
+    Parameters: E. Fossas, G. Olivar, Study of chaos in the buck converter, IEEE Trans.
+    Circuits and Systems I 43, 1996.
     """
 
     input_units = ("V",)
@@ -85,10 +85,11 @@ class CukConverter(HybridSystem):
     the supply, here counted as positive). While the switch is open, the diode conducts all the time
     (continuous conduction). Input `u` is added to the reference current.
 
-    S. Ćuk, R. D. Middlebrook, A new optimum topology switching dc-to-dc converter, IEEE Power
-    Electronics Specialists Conference, 1977; under such control, beyond its stable cycle: C. K.
-    Tse, W. C. Y. Chan, Chaos from a current-programmed Ćuk converter, Int. J. Circuit Theory and
-    Applications 23, 1995. The parameters have typical values, which are from neither source.
+    S. Ćuk, R. D. Middlebrook, A new optimum topology switching dc-to-dc converter, IEEE
+    Power Electronics Specialists Conference, 1977. C. K. Tse, W. C. Y. Chan, Chaos from
+    a current-programmed Ćuk converter, Int. J. Circuit Theory and Applications 23,
+    1995, study this control where the cycle is no longer stable. The parameters have
+    typical values, which are from neither source.
     """
 
     input_units = ("A",)

@@ -34,8 +34,9 @@ class VerticalHopper(HybridSystem):
     Input `u` is a force on the upper mass. With `retention` = r < 1 a touchdown multiplies the
     speed of the upper mass by r.
 
-    S. A. Burden, S. Revzen, S. S. Sastry, Dimension reduction near periodic orbits of hybrid
-    systems, CDC-ECC 2011, and HSCC 2013, whose parameters these are.
+    S. A. Burden, S. Revzen, S. S. Sastry, Dimension reduction near periodic orbits of
+    hybrid systems, CDC-ECC 2011, and HSCC 2013. The parameters are from the second
+    source.
     """
 
     input_units: ClassVar[tuple[str, ...]] = ("N",)

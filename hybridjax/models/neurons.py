@@ -52,9 +52,9 @@ class AdExNeuron(DrivenNeuron):
     v becomes infinite within a time of C / gL exp(-(v - threshold) / slope), which is 3.5e-4 ms at
     `peak`. (At the paper's peak of 20 mV, this time is too short for double precision.)
 
-    R. Brette, W. Gerstner, Adaptive exponential integrate-and-fire model as an effective
-    description of neuronal activity, J. Neurophysiology 94, 2005, whose parameters these are, but
-    for `peak`.
+    Equations, and all parameters except `peak`: R. Brette, W. Gerstner, Adaptive
+    exponential integrate-and-fire model as an effective description of neuronal
+    activity, J. Neurophysiology 94, 2005.
     """
 
     input_units = ("pA",)
@@ -98,8 +98,8 @@ class IzhikevichNeuron(DrivenNeuron):
     States: potential `v` of the membrane, and its recovery `w` (u in the paper). The current I(t) =
     current + amplitude cos(2 pi t / T) causes one spike in each period.
 
-    E. M. Izhikevich, Simple model of spiking neurons, IEEE Trans. Neural Networks 14, 2003, whose
-    parameters for regular spiking these are.
+    Equations, and parameters for regular spiking: E. M. Izhikevich, Simple model of spiking
+    neurons, IEEE Trans. Neural Networks 14, 2003.
     """
 
     input_units = ("mV/ms",)

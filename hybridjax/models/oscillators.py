@@ -242,9 +242,10 @@ class ChuaCircuit(HybridSystem):
     The field is continuous across x = 1 and x = -1; its derivative jumps. States: voltages `x` and
     `y` of both capacitors, and current `z` of the coil, without dimensions.
 
-    T. Matsumoto, L. O. Chua, M. Komuro, The double scroll, IEEE Trans. Circuits and Systems 32,
-    1985, the source of this dimensionless form. Their double scroll is at alpha = 9; at alpha = 8,
-    before its periods double, there is a cycle around either of two equilibria.
+    T. Matsumoto, L. O. Chua, M. Komuro, The double scroll, IEEE Trans. Circuits and
+    Systems 32, 1985, the source of this dimensionless form. Their double scroll is at
+    alpha = 9. At alpha = 8, where periods have not yet doubled, there are two cycles,
+    one around each of two equilibria.
     """
 
     alpha: Parameter = parameter(8.0, doc="ratio of the capacitors")

@@ -185,11 +185,12 @@ class TrottingQuadruped(TwoLeggedBar):
 class SLIPRunner(HybridSystem):
     """A point mass on a massless spring, which touches down at a fixed angle of attack.
 
-    States: height `y` and speeds `vx`, `vy`; in stance also `x`, the position of the mass relative
-    to the foot. (In flight this position has no effect and is left out, so that a step is a cycle.)
-    Input `u` is added to the angle of attack. Energy is conserved (output `energy`): one multiplier
-    is exactly 1, and cycles come in families, one for each energy:
-    `find_limit_cycle(runner, conserved={"energy": 1784.8}, ...)`.
+    States: height `y` and speeds `vx`, `vy`; in stance also `x`, the position of the
+    mass relative to the foot. (In flight this position has no effect and is left out,
+    so that a step is a cycle.) Input `u` is added to the angle of attack. Energy is
+    conserved (output `energy`). One multiplier is therefore exactly 1, and there is a
+    family of cycles, with one cycle for each energy. `find_limit_cycle(runner,
+    conserved={"energy": 1784.8}, ...)` finds the cycle of a given energy.
 
     R. Blickhan, The spring-mass model for running and hopping, J. Biomechanics 22, 1989; H. Geyer,
     A. Seyfarth, R. Blickhan, Spring-mass running: simple approximate solution and application to

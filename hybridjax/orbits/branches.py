@@ -219,9 +219,9 @@ def continuation(
         states. Default: 0.05.
     - `max_points`: largest number of cycles in each direction. Default: 1000.
 
-    **Returns:** a `Branch`. No error is raised if it ends earlier: `ends` has the reason (an event
-    that grazes, is lost or comes out of order; no convergence even in the shortest step; an
-    equilibrium in place of a cycle).
+    **Returns:** a `Branch`. If it ends earlier, no error is raised, and `ends` has the reason: an
+    event that grazes, is lost or comes out of order, no convergence even in the shortest step, or
+    an equilibrium in place of a cycle.
 
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of the values.

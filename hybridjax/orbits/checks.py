@@ -156,7 +156,7 @@ def check_outputs(cycle: LimitCycle, outputs: OutputNames) -> Outputs:
 
 
 def _check_output_period(cycle: LimitCycle, output: Output) -> None:
-    """**Raises:** `DefinitionError` as `check_outputs`."""
+    """**Raises:** `DefinitionError` in the cases of `check_outputs`."""
     s = cycle.structure
     clocked = list(check_output(s, output))
     if not clocked:
@@ -282,7 +282,7 @@ def _no_period(system: HybridSystem, problem: str) -> str:
 def check_found(cycle: LimitCycle) -> None:
     """Check the functions of a system on its cycle.
 
-    **Raises:** `DefinitionError` as `check_clock`, `check_claims` and `check_jumps`.
+    **Raises:** `DefinitionError` in the cases of `check_clock`, `check_claims` and `check_jumps`.
     """
     s = cycle.structure
     pieces = to_host(cycle.pieces)

@@ -143,7 +143,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
         once_in_call(("compared", id(self)), self, compare)
 
     def require_found(self) -> None:
-        """**Raises:** `DefinitionError` if the search failed, and as `require_current`."""
+        """**Raises:** `DefinitionError` if the search failed, and in the cases of
+        `require_current`."""
         self.require_current()
         code = Result.OK if is_traced(self.result) else Result(int(self.result))
         if code not in _FOUND:
@@ -184,7 +185,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
 
     @property
     def multipliers(self) -> Complex[np.ndarray, " r"]:
-        """The non-zero Floquet multipliers, by decreasing modulus (on the host).
+        """The non-zero Floquet multipliers, by decreasing modulus, without derivatives.
 
         They are computed from the factors without forming their product, so that small multipliers
         are accurate. If a factor contracts too strongly for double precision, the Jacobians of
@@ -261,8 +262,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Doubts about the cycle: the results of a second integration along it, by another method
-        with other steps (at the first access).
+        """Doubts about the cycle. They are the results of a second integration along
+        it, by another method with other steps, which is made at the first access.
 
         A cycle that `find_limit_cycle` returns has passed these checks, so that no finding is
         "refused". A cycle of a sweep or of a branch was checked at its guards only; here it is
@@ -283,8 +284,8 @@ class LimitCycle(WithMultipliers, eqx.Module):
 
     @property
     def stable(self) -> bool:
-        """True if all multipliers lie inside the unit circle, but for those of exactly 1 that
-        belong to conserved quantities."""
+        """True if all multipliers lie inside the unit circle. Multipliers of exactly 1 that belong
+        to conserved quantities do not count."""
         inside = np.abs(self.multipliers) < 1
         free = len(inside) - len(self.conserved)
         return bool(np.sum(inside) == free)

@@ -122,9 +122,10 @@ def find_limit_cycle(
 ) -> LimitCycle:
     """Find a stable or unstable limit cycle by Newton's method on the return map.
 
-    If Newton's method fails, as it does if a step leaves the domain of the return map, the search
-    is repeated with the smaller steps of the Levenberg-Marquardt method, then from the state to
-    which the flow leads from the guess in 40 periods.
+    Newton's method fails, for example, if a step leaves the domain of the return map.
+    Then the search is repeated with the smaller steps of the Levenberg-Marquardt
+    method. If this fails, too, the guess is simulated for 40 periods, and the search
+    begins at the final state.
 
     A clocked system has the period of its clock, and the return map is taken at the guess's phase
     of the clock. The period of an autonomous system is computed; its return map is taken on
@@ -132,19 +133,21 @@ def find_limit_cycle(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`: one of `hj.models`, or your own. With a state as `guess`, a field
-        (t, q) of one chart without events stands for it (`hj.HybridSystem.from_functions`).
-    - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the best guess.
-        A state, in order or by name, stands for a `Guess` where only one chart has such states.
-        With a cycle, leave out `settle` and `max_period`; the search begins at the same phase of
-        the clock as that cycle, or, if an event has passed this phase, far from events. Default:
-        the model's own guess.
-    - `section`: the section of the return map of an autonomous system, e.g. `Crossing("v",
-        "falling")`, or the name of an event. Newton's method starts at the guess if it lies on the
-        section, else where the flow from the guess first crosses it. Default: the section right
-        after the event that the guess names (`Guess(..., after="heelstrike")`), or else the plane
-        through the guess that is orthogonal to the flow (in scaled states). If the flow does not
-        return to this plane, such a plane through a later state is taken.
+    - `system`: a `HybridSystem`: one of `hj.models`, or your own. If `guess` is a
+        state, the system may also be the vector field (t, q) of a single chart without
+        events (`hj.HybridSystem.from_functions`).
+    - `guess`: a rough `Guess`, or the `LimitCycle` of a similar system, which is the
+        best guess. If only one chart has such states, a state suffices: `(1.0, 0.0)` or
+        `{"y": 1.0, "v": 0.0}`. With a cycle, leave out `settle` and `max_period`; the
+        search begins at the same phase of the clock as that cycle, or, if an event has
+        passed this phase, far from events. Default: the model's own guess.
+    - `section`: the section of the return map of an autonomous system, e.g.
+        `Crossing("v", "falling")`, or the name of an event. Newton's method starts at
+        the guess if it lies on the section, else where the flow from the guess first
+        crosses it. Default: the section right after the event that the guess names
+        (`Guess(..., after="heelstrike")`), or else the plane through the guess that is
+        orthogonal to the flow (in scaled states). If the flow does not return to this
+        plane, the section is such a plane through a later state.
     - `multiplicity`: number of periods of the clock, or returns to the section, after which the
         cycle closes: 2 for the cycle that is born in a period doubling. Default: 1, or that of the
         cycle that is the guess.
@@ -155,12 +158,12 @@ def find_limit_cycle(
     - `settle`: time to simulate before Newton's method begins, so that transients decay (the paper
         takes 60 s). It does not help if the cycle is unstable. Default: 0.
     - `max_period`: for autonomous systems, the time after which the search for a return to the
-        section is given up. Default: 1000 times the time scale of the states, at the guess or at
-        the end of this search, where it is longer. In charts with an implicit method, the time
-        scale is that of the slowest mode.
+        section is given up. Default: 1000 times the time scale of the states. It is computed at the
+        guess and at the end of this search, and the longer one is taken. In charts with an implicit
+        method, the time scale is that of the slowest mode.
     - `scale`: characteristic magnitudes of states by name, such as `{"y": 1e-6}`; errors are
         relative to these. Default: each state's largest modulus on the cycle, so that results do
-        not depend on units (under a JAX transformation, those of the guess).
+        not depend on units. Under a JAX transformation, the default is the `scale` of the guess.
     - `settings`: accuracy of the integration (default: 1e-12), largest number of steps (also of
         `linearize`), and `solver`; "auto" uses an implicit method in the charts that are stiff on
         the cycle.

@@ -265,12 +265,11 @@ def flow(
 
     **Arguments:**
 
-    - `system`: a `HybridSystem`; with a state, a field (t, q) of one chart without events stands
-      for it.
+    - `system`: a `HybridSystem`. If the start is a state, it may also be the vector field (t, q) of
+      a single chart without events.
     - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
-      that ended there. A `Guess` with states (L, n) starts L flows. A state (n,), in order or by
-      name, stands for a `Guess` where only one chart has such states, and a `LimitCycle` for its
-      state at `anchor`.
+      that ended there. A `Guess` with states (L, n) starts L flows. If only one chart has such
+      states, a state (n,) suffices, as numbers or by name. A `LimitCycle` starts at its `anchor`.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
     - `within`: the longest duration, required for all ends other than a time. Do not make it much
@@ -333,7 +332,7 @@ def requested(
 ) -> _Request:
     """What is asked for.
 
-    **Raises:** `DefinitionError` as `flow`.
+    **Raises:** `DefinitionError` in the cases of `flow`.
     """
     require_x64(system, start, settings)
     settings = Settings() if settings is None else settings

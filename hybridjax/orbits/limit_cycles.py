@@ -195,15 +195,17 @@ def find_limit_cycles(
 ) -> LimitCycles:
     """Find the limit cycles of many systems that differ in their parameters.
 
-    From 250 systems on, all of them first follow the itinerary of the guess: its charts and events
-    in order, and its steps. Newton's method on this itinerary is one compiled program. A system
-    that leaves it then follows the itinerary of a neighbor, which a search has found there. Each
-    cycle is integrated again, by another method with other steps.
+    If there are 250 systems or more, all of them first follow the itinerary of the
+    guess: its charts and events in order, and its steps. Newton's method on this
+    itinerary is one compiled program. A system that leaves the itinerary then follows
+    that of a neighboring system, which a search has found. Each cycle is integrated
+    again, by another method with other steps.
 
-    Fewer systems, and those that no itinerary suits, are searched side by side: first a few, from
-    the guess, then four times as many in each round, from cycles of neighbors. If Newton's method
-    fails for a system, the system is simulated for 8 or 40 periods, and Newton's method starts
-    again from the final state.
+    Fewer systems, and systems that leave all itineraries, are searched in parallel
+    rounds. The first round has a few systems and starts from the guess. Each further
+    round has four times as many systems, and starts from cycles of neighbors. If
+    Newton's method fails for a system, the system is simulated for 8 or 40 periods, and
+    Newton's method starts again from the final state.
 
     **Arguments:**
 
@@ -215,8 +217,8 @@ def find_limit_cycles(
     - `execution`: systems per call (`batch`, Default: 250 on itineraries, otherwise 1024) and
         threads (`workers`).
 
-    **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. Nothing is raised
-    for those.
+    **Returns:** `LimitCycles`; its `failed` lists the systems without a cycle. They
+    raise no error.
 
     **Raises:** `DefinitionError` for systems that do not belong together, or have no parameters.
 
@@ -501,7 +503,7 @@ def examined(
     **Arguments:** `together`: whether events coincide. `walked`: cycles that a second integration
     has checked already. Default: none.
 
-    **Raises:** `DefinitionError` as `check_found`, for one of eight cycles.
+    **Raises:** `DefinitionError` in the cases of `check_found`, for one of eight cycles.
     """
     result = cycles.result.copy()
     rows = np.flatnonzero(together & cycles.ok)

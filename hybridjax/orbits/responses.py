@@ -98,7 +98,8 @@ class Impulse(NamedTuple):
 @leading_on
 class Locked(NamedTuple):
     """A state in which phases move together: `lead` of the push, in cycles, and the `rate` at which
-    deviations grow, per time and strength of the push; negative where it is stable."""
+    deviations grow, per time and strength of the push. The rate is negative if the state is
+    stable."""
 
     lead: float
     rate: float
@@ -109,7 +110,7 @@ class Coupling(Showable, eqx.Module):
     r"""Mean effect of a weak push, by its lead $\psi$ in cycles (see `Responses.coupling`).
 
     The rate of the phase is $f_0 + \varepsilon \Gamma(\psi)$ in cycles per time under a push of the
-    strength $\varepsilon$. Calls return $\Gamma$ at some leads.
+    strength $\varepsilon$. `coupling(lead)` returns $\Gamma$ at one or several leads $\psi$.
 
     **Fields:** `coefficients` (n,): those of $e^{2 \pi i n \psi}$ in $\Gamma$, n = 0, 1, ...
     """
@@ -187,8 +188,8 @@ class Responses(Showable, eqx.Module):
 
     - `period`; `multipliers` (r,) and `exponents` (r,), per unit of time, of the modes that have
         amplitudes, by decreasing modulus.
-    - `modes` (r, d): the modes at phase 0. They are scaled so that, at this phase, the response of
-        an amplitude to the states is a vector of length 1 (in units of the states) whose largest
+    - `modes` (r, d): the modes at phase 0. Their scale follows from the response of an amplitude to
+        the states at this phase: it is a vector of length 1 (in units of the states) whose largest
         entry is real.
     - `left_out`: number of modes without an amplitude: with multipliers below 1e-6, and those that
         events or sliding remove at once.

@@ -110,8 +110,8 @@ class Returns(MultiplierFit):
     - `noise` (d,): standard deviation of each coordinate in returns from nearly equal states.
     - `residual`: largest distance between state and return, in units of the range of the
       coordinate on the cycle.
-    - `bound`: multipliers that are not listed cannot be told from 0; this is the largest modulus
-      that they may have (0 if all are listed).
+    - `bound`: the largest modulus that multipliers may have that are not listed, because they
+      cannot be distinguished from 0. It is 0 if all are listed.
     - `findings`: multipliers that noise may hide, and steps that give different multipliers.
     """
 

@@ -89,9 +89,10 @@ def standard_errors(
 ) -> Plot:
     """Draw the standard error against the number of cycles, on logarithmic axes.
 
-    Lines are Cramer-Rao bounds for the optimal design and for the design that it improves. Points
-    are standard errors of sequential designs after each block of experiments; the first block has
-    the design that is improved. For several quantities, the root of the sum of squares is drawn.
+    Lines are Cramer-Rao bounds for the optimal design and for the design that it
+    improves. Points are standard errors of sequential designs after each block of
+    experiments. The first block has the original design, before it is improved. For
+    several quantities, the root of the sum of squares is drawn.
 
     **Arguments:**
 

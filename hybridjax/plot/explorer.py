@@ -286,7 +286,8 @@ def explore(
     the `figure`. Parameters are in their units.
 
     **Raises:** `DefinitionError` for a parameter that does not exist, a range without its present
-    value, and as `find_limit_cycle`; `ComputationError` if there is no cycle to begin with.
+    value, and in the cases of `find_limit_cycle`; `ComputationError` if there is no cycle to begin
+    with.
 
     **Example:**
 

@@ -55,10 +55,10 @@ def htf(
 ) -> Plot:
     """Draw |H_m| against the input frequency, on a logarithmic scale.
 
-    One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`), are drawn
-    as broad pale lines under the estimates, in any order of the arguments: models at the
-    frequencies of the first HTF, and models alone over all. HTFs with a variance have a band that
-    holds the true value at each frequency with a probability of 95 %.
+    One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`), are drawn as
+    broad pale lines under the estimates, in any order of the arguments. Models are drawn at the
+    frequencies of the first HTF. Without an HTF, they are drawn over all frequencies. HTFs with a
+    variance have a band that holds the true value at each frequency with a probability of 95 %.
 
     **Arguments:**
 

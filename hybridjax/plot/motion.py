@@ -57,8 +57,8 @@ Portrait = Callable[[LimitCycle], list[Artist]]
 class Motion(FuncAnimation):
     """An animation of matplotlib that repeats, and shows itself in notebooks.
 
-    **Fields:** `figure`; `times` (n,), those of its frames since the begin, in the system's unit
-    (of a branch, values of the parameter); `interval`, seconds from one frame to the next.
+    **Fields:** `figure`; `times` (n,), the times of the frames since the beginning, in the system's
+    unit (for a branch, values of the parameter); `interval`, seconds from one frame to the next.
     """
 
     def __init__(

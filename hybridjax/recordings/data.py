@@ -47,8 +47,8 @@ class SectionData(Showable, eqx.Module):
     - `period`: the median. `bandwidth`: bandwidth of the splines through the outputs, in Hz.
     - `spikes`: for each signal (inputs, then outputs), the number of samples left out as spikes.
     - `unresolved`: median change of an output at sections if every second sample of the recording
-      were left out, relative to its rms deviation; of the output with the largest ratio. It is
-      below 1.3 for noise.
+      is left out, divided by the rms deviation of the output. It is for the output with the largest
+      ratio. Noise alone gives values below 1.3.
     """
 
     records: tuple[SectionSeries, ...]

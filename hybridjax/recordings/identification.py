@@ -193,9 +193,9 @@ def identify_recording(
       file, or a table (`hj.Recording.from_frame`).
     - `sections`, `inputs`, `outputs`, `n_sections`, `bandwidth`, `timing`: those of
       `sample_sections`, with the same defaults.
-    - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most
-      that the reference determines, up to 4; without inputs, the first of 1 to 4 of which the
-      largest modulus agrees with that of one multiplier more.
+    - `order`: the number of multipliers. Default: that of `select_order`; in a loop, the most that
+      the reference determines, up to 4; without inputs, the first number from 1 to 4 whose largest
+      modulus agrees with that of the next number.
     - `drift`: number of cycles; slower changes are drift, not responses to the inputs. Drift is
       removed from the outputs and from the signals that define the phase, the phase is estimated
       from the result, and the fit allows for drift that remains. Default: None.
@@ -207,9 +207,9 @@ def identify_recording(
     method `write_report` writes a page. Without inputs, `hj.recordings.NaturalIdentification` with
     `phase`, `data`, `fit` (`NaturalMultipliers`) and `findings`.
 
-    **Raises:** `DefinitionError` for errors that the inspection finds, for `references` without
-    inputs, and as `estimate_phase`, `sample_sections`, `fit_series` and `natural_multipliers`;
-    `PrecisionError` in single precision.
+    **Raises:** `DefinitionError` for errors that the inspection finds, for `references`
+    without inputs, and in the cases of `estimate_phase`, `sample_sections`,
+    `fit_series` and `natural_multipliers`; `PrecisionError` in single precision.
 
     **Example:**
 

@@ -75,14 +75,14 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
 
     **Fields:**
 
-    - `multipliers` (d,): by instruments, without the bias of measurement noise, and with that of
-      few cycles corrected.
-    - `plain` (d,): by least squares on the return map, as is usual; with both biases.
-    - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles, each beside its
-      nearest of `multipliers` and `plain`.
+    - `multipliers` (d,): estimated by instruments, which removes the bias of
+      measurement noise. The bias of few cycles is corrected.
+    - `plain` (d,): estimated by least squares on the return map, as is usual. It has both biases.
+    - `draws`, `plain_draws` (B, d): both for B resamplings of blocks of cycles. The values of a
+      draw are matched with the nearest of `multipliers` or `plain`.
     - `strength`: fraction of the states' variance that the instruments explain.
-    - `cycles`: number of used cycles, which are followed by another one, in so many `records`.
-      `block`: cycles of a block; those of a record, where whole records are drawn.
+    - `cycles`: number of used cycles; each is followed by another cycle. `records`: number of
+      records. `block`: number of cycles in a block, or in a record if whole records are drawn.
     - `findings`: reasons to doubt the multipliers. There is one if a further multiplier, such as
       one for slow drift of the outputs, changes the largest modulus.
     """
@@ -169,14 +169,15 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         *,
         plain: bool = False,
     ) -> Float[np.ndarray, "d 2"]:
-        """Return bounds that hold the modulus of each multiplier with this probability, in the
-        order of moduli; `plain`: those of least squares. A complex pair has one modulus, and one
-        interval.
+        """Return bounds that hold the modulus of each multiplier with this probability,
+        in the order of moduli. A complex pair has one modulus, and one interval. With
+        `plain`, the bounds are those of least squares.
 
-        They are the estimate plus and minus the standard error of the bootstrap, times the quantile
-        of Student's distribution for so many blocks. (Percentiles of the bootstrap lie on the wrong
-        side: estimates of slow multipliers scatter towards zero, so that the truth lies above.) A
-        real multiplier whose interval contains 0 has moduli from 0 on.
+        They are the estimate plus and minus the standard error of the bootstrap, times
+        the quantile of Student's distribution for so many blocks. Percentiles of the
+        bootstrap would lie on the wrong side: estimates of slow multipliers scatter
+        towards zero, so that the true value lies above. A real multiplier whose
+        interval contains 0 has moduli from 0 on.
 
         **Example:**
 
@@ -296,11 +297,13 @@ def natural_multipliers(
 ) -> NaturalMultipliers:
     r"""Estimate Floquet multipliers from variability alone: output-only identification.
 
-    The return map of every section is estimated from the deviations in successive cycles, as in the
-    Floquet analysis of gait (Hurmuzlu and Basdogan 1994). Disturbances of the rhythm are unknown,
-    and taken as independent from cycle to cycle. The state at a section consists of the `order`
-    combinations that vary most of all outputs there and at the section before. All sections have
-    the same multipliers: the coefficients of their characteristic polynomials are averaged.
+    The return map of every section is estimated from the deviations in successive
+    cycles, as in the Floquet analysis of gait (Hurmuzlu and Basdogan 1994).
+    Disturbances of the rhythm are unknown, and are assumed to be independent from cycle
+    to cycle. The state at a section consists of combinations of all outputs at this
+    section and the one before. It has the `order` combinations with the largest
+    variance. All sections have the same multipliers: the coefficients of their
+    characteristic polynomials are averaged.
 
     The mean of each record is estimated, which biases the multipliers if there are few cycles. This
     bias is corrected to first order in the inverse number of cycles (Nicholls and Pope 1988).
@@ -316,8 +319,9 @@ def natural_multipliers(
     - `order`: the number of multipliers. Combinations that vary less than these count as
       disturbances. If one multiplier more contradicts the largest modulus, `findings` say so.
       Default: 1.
-    - `seed`: seed of the bootstrap, which draws blocks of successive cycles with replacement
-      (Künsch 1989), within each record; whole records where these are short. Default: 0.
+    - `seed`: seed of the bootstrap, which draws blocks of successive cycles with
+      replacement (Künsch 1989), within each record. If records are short, it draws
+      whole records. Default: 0.
 
     **Returns:** `hj.recordings.NaturalMultipliers`: `multipliers` (d,), complex, without unit;
     `draws` (B, d) of the bootstrap, from which `interval` follows; `plain` (d,), those of a plain

@@ -53,7 +53,7 @@ def select_order(
     - `extra_lags`: as in `fit_multipliers`, for HTFs. Default: N.
 
     **Returns:** `hj.identify.OrderSelection` for HTFs, `hj.recordings.HeldOutOrders` for data. Its
-    `order` is the number that is selected; `orders` (k,) are those compared.
+    `order` is the selected number; `orders` (k,) are the compared numbers.
 
     **Raises:** `DefinitionError` for HTFs as `fit_multipliers`; for data with too few cycles for
     one multiplier.

@@ -124,7 +124,7 @@ class Phase(Showable, eqx.Module):
         return super().plot(ax=ax)
 
     def by_trial(self, recording: Recording) -> list[tuple[Trial, tuple[Winding, ...]]]:
-        """Return each trial with its stretches.
+        """Return each trial with the stretches (uninterrupted parts) of its phase.
 
         **Raises:** `DefinitionError` for a recording with another number of trials.
         """
@@ -141,7 +141,7 @@ class Phase(Showable, eqx.Module):
     ) -> list[tuple[Trial, Series, tuple[Winding, ...]]]:
         """Return each trial with the samples of a signal and its stretches.
 
-        **Raises:** `DefinitionError` as `by_trial`, and for an unknown signal.
+        **Raises:** `DefinitionError` in the cases of `by_trial`, and for an unknown signal.
         """
         k = recording.column(name)
         return [(t, t.values[:, k], parts) for t, parts in self.by_trial(recording)]

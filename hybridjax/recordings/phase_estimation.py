@@ -69,13 +69,13 @@ def estimate_phase(
           direction, and fast: at mid-stance, at the apex. A signal that jumps there, as of a
           trigger, is not smoothed.
         - the name of a recorded event, or its `AtEvent`: the phase grows by one from each event to
-          the next, linearly in between. Events that follow the one before by less than half of the
-          trial's median period are taken for doubled and left out; where an interval is longer than
-          1.5 median periods an event was missed, and these cycles are left out. In irregular
-          rhythms, with intervals of all lengths, these limits are the first gaps in the
-          distribution of intervals. A crossing in a gap counts as missed.
-          This phase, like that of a `Crossing`, depends on the time of the next event, and so do
-          outputs that are sampled at a given phase.
+          the next, linearly in between. An event less than half of the trial's median period after
+          the one before counts as doubled, and is left out. If an interval is longer than 1.5
+          median periods, an event was missed, and the cycles of this interval are left out. In
+          irregular rhythms, with intervals of all lengths, these limits are the first gaps in the
+          distribution of intervals. A crossing in a gap counts as missed. This phase, like that of
+          a `Crossing`, depends on the time of the next event, and so do outputs that are sampled at
+          a given phase.
     - `bandwidth`: bandwidth in Hz of the splines through the signals. Default: 32 harmonics of the
       cycle for a `KinematicPhase`, 16 for a `Crossing`.
 

@@ -49,8 +49,8 @@ def read_recording(
     - *Excel* (`.xlsx`, `.xlsm`): the first sheet, in the same way.
     - *Parquet*, *Feather*, *NPZ*: an array for each column.
     - *MATLAB* (`.mat`, of all versions) and *HDF5* (`.h5`, `.hdf5`): arrays by their names in
-      structs, `imu.gyro`, or their paths, `imu/gyro`; columns of matrices are `imu.gyro.0`, ...
-      The times of an array are those in its struct or group, or in the nearest around it.
+      structs, `imu.gyro`, or their paths, `imu/gyro`; columns of matrices are `imu.gyro.0`, ... The
+      times of an array are in its struct or group, or in the nearest enclosing one.
     - *NetCDF* (`.nc`): variables by their names, with their scale factors, offsets and marks of
       missing values.
     - *C3D*: markers `LASI.x`, `LASI.y`, `LASI.z`, analog channels, events with their contexts.
@@ -81,8 +81,8 @@ def read_recording(
 
     **Raises:** `DefinitionError` for files that do not exist, columns or signals that they do not
     have, unknown units of time, columns that differ between files, events that are all outside of
-    the recording, packages that are not installed, and as `Recording`; `FileFormatError` for files
-    that cannot be read, with the line.
+    the recording, packages that are not installed, and in the cases of `Recording`;
+    `FileFormatError` for files that cannot be read, with the line.
 
     **Example:**
 

@@ -125,8 +125,8 @@ class Recording(Showable, eqx.Module):
 
         **Arguments:**
 
-        - `time` (n,): times of the samples, in seconds; strictly increasing. A table with a
-          column `time`, as `from_frame` takes it, stands for times and signals.
+        - `time` (n,): times of the samples, in seconds; strictly increasing. A table with a column
+          `time`, as `from_frame` takes it, can replace times and signals.
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing. Series
           of pandas must have the same index, and their samples the same order.
         - `events`: times of events by name, such as foot strikes.
@@ -392,7 +392,7 @@ def _summary(trial: Trial) -> str:
 def _table_of(where: str, frame: Any, time: str) -> Table:
     """Return times, signals and events of a table with named columns.
 
-    **Raises:** `DefinitionError` for what has no columns, and as `parse_table`.
+    **Raises:** `DefinitionError` for data without columns, and in the cases of `parse_table`.
     """
     if not _has_columns(frame):
         raise DefinitionError(

@@ -74,9 +74,9 @@ def sample_sections(
     that is not smooth.
 
     Splines bridge gaps up to the mean time between sections, but not less than three samples of a
-    signal. In longer gaps, values are NaN: an output at a section in a gap of its own samples, or
-    of those of the angle that is the phase; an input if the interval from its section to the next
-    touches a gap of its own samples.
+    signal. In longer gaps, values are NaN. An output is NaN if its section lies in a gap of its own
+    samples, or of the samples of the angle that is the phase. An input is NaN if the interval from
+    its section to the next touches a gap of its own samples.
 
     **Arguments:**
 
@@ -90,12 +90,12 @@ def sample_sections(
     - `bandwidth`: bandwidth in Hz of the smoothing splines through the outputs (see `spline`).
       Default: N per period, which averages over about one section. Infinite: interpolating cubic
       splines.
-    - `sampled`: "mean" for the mean of an input from each section to the next (it is taken as
-      linear between samples), or "middle" for the sample nearest to the middle, for an input that
-      is held from section to section (zero-order hold).
-    - `timing`: an extra output with the time at which a section was crossed: "clock" for systems
-      driven by a clock, the time minus that of the clock; "duration" for others, the time since the
-      section before.
+    - `sampled`: "mean" takes the mean of an input from each section to the next, with linear
+      interpolation between samples. "middle" takes the sample nearest to the middle, for an input
+      that is held from section to section (zero-order hold).
+    - `timing`: an additional output with the time at which a section was crossed. "clock": the time
+      minus that of the clock, for systems driven by a clock. "duration": the time since the section
+      before, for other systems.
 
     The average cycle of each trial is subtracted, and the records let fits allow for a constant
     that remains (`SectionSeries.drift`). Drift of sensors also moves the phase: remove it from the
@@ -107,7 +107,8 @@ def sample_sections(
 
     **Raises:** `DefinitionError` for unknown names, no names, constant signals, outputs or times
     that repeat from cycle to cycle, a bandwidth below the rate of the rhythm, another number of
-    sections than the family's, a recording without a whole cycle, and as `estimate_phase`.
+    sections than the family's, a recording without a whole cycle, and in the cases of
+    `estimate_phase`.
 
     **Example:**
 

@@ -51,8 +51,8 @@ def monte_carlo(
     `value`; and `failed`, 1 for draws that raised `ComputationError`.
 
     **Raises:** `DefinitionError` for results that are no numbers, or that change their names, their
-    shapes, or from real to complex ones, and as `sweep`; `ComputationError` if all draws
-    fail; any other error that `function` raises.
+    shapes, or from real to complex ones, and in the cases of `sweep`; `ComputationError` if all
+    draws fail; any other error that `function` raises.
 
     **Example:**
 

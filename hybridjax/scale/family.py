@@ -75,7 +75,8 @@ class SweepPoints:
         """Return points that cover a box evenly, from a scrambled Sobol sequence (Owen 1998).
 
         **Arguments:** `ranges`: the lowest and the highest value of each parameter. `count`: number
-        of points, best a power of two. `seed`: seed of the scrambling. Default: 0.
+        of points, best a power of two. `seed`: seed of the random scrambling of the Sobol sequence.
+        Default: 0.
 
         **Raises:** `DefinitionError` for an empty range.
         """

@@ -70,12 +70,13 @@ def sweep(
 ) -> Any:
     """Find limit cycles over a space of parameters, as a labelled array.
 
-    If there are several pieces, a coarse pass first finds cycles at points all over the space. A
-    piece of neighboring points then starts from these cycles, and continues from its own solved
-    points. A piece does not depend on which process computes it, nor when: results are the same to
-    the last bit for any number of processes and interruptions (on machines of one kind). A point at
-    which the search fails is tried again from the nearest point that succeeded, and after a
-    simulation of the transient.
+    If there are several pieces, a coarse pass first finds cycles at points all over the
+    space. A piece of neighboring points then starts from these cycles, and continues
+    from its own solved points. A piece does not depend on which process computes it,
+    nor when: results are the same to the last bit for any number of processes and
+    interruptions (on machines of one kind). If the search fails at a point, it is
+    repeated from the nearest point that succeeded, and after a simulation of the
+    transient.
 
     **Arguments:**
 
@@ -83,29 +84,33 @@ def sweep(
         dots); or a function of these parameters that returns a system.
     - `values`: values of each parameter by name, of which all combinations are taken; or
         `hj.scale.SweepPoints`. A number is the only value of its parameter.
-    - `parameters`: such values as keywords, `hj.sweep(system, k=[9, 10])`, of parameters without
-        dots in their names.
-    - `quantities`: quantities to keep of each cycle: "period", "state" (at its phase origin, with
-        the chart), "multipliers", "spectral_radius" (their largest modulus), "residual"; and
-        functions of a `LimitCycle`, kept under their names, that return a number or an array of
-        always the same shape. NaN where they raise `ComputationError`. The code of the cycle's
-        `Result` is always kept. Default: period and spectral radius.
+    - `parameters`: the same values as keywords, as in `hj.sweep(system, k=[9, 10])`,
+        for parameters without dots in their names.
+    - `quantities`: quantities to keep of each cycle: "period", "state" (at its phase
+        origin, with the chart), "multipliers", "spectral_radius" (their largest
+        modulus), "residual". A quantity may also be a function of a `LimitCycle` that
+        returns a number or an array of always the same shape. Its value is kept under
+        the name of the function, and is NaN where the function raises
+        `ComputationError`. The code of the cycle's `Result` is always kept. Default:
+        period and spectral radius.
     - `guess`: the cycle of a similar system. Default: that of the model in the middle.
     - `chunk`: largest number of points in a piece. Default: 4000, with functions 250;
         more in sweeps of more than 64 such pieces without functions.
-    - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in it already
-        are not computed again: after an interruption, repeat the call. It holds digests of the
-        programs of the model, and of the code of functions with the values, helpers and classes
-        that this code can reach (not of databases and files): with others, the call is refused.
+    - `store`: a folder, or an address for fsspec, of a Zarr group. Points that are in
+        the store already are not computed again: after an interruption, repeat the
+        call. The store also holds digests of the programs of the model and of the code
+        of functions, with the values, helpers and classes that this code can reach (not
+        of databases and files). A call with other digests raises an error.
     - `client`: a `distributed.Client`, whose workers compute the pieces.
 
     **Returns:** an `xarray.Dataset`, whose coordinates are the parameters with their units. With a
     store, values are read when they are used.
 
-    **Raises:** `DefinitionError` for a parameter that does not exist, for quantities that do not
-    exist or change their shape, if the store holds another sweep (with the difference) or cannot be
-    written, and for a client whose workers cannot run the job; `ComputationError` if there is no
-    cycle in the middle, or the cluster is lost.
+    **Raises:** `DefinitionError` for a parameter that does not exist, and for
+    quantities that do not exist or change their shape. `DefinitionError` if the store
+    cannot be written or holds another sweep (the message gives the difference), and if
+    workers of the client cannot run the job. `ComputationError` if there is no cycle in
+    the middle, or if the cluster is lost.
 
     **Example:**
 

@@ -93,8 +93,9 @@ class AbstractSections(Definition):
 
     - `check(structure)` raises `DefinitionError` if the family does not fit the system.
     - `bind(structure, orbit)` returns `BoundSections`. The orbit has the fields `period`, `t` (M,),
-      `chart` (M,) and `q` (M, d), at M equal times in one period from the
-      anchor, or from any point of the cycle if `anchor` is no `Crossing`. JAX traces this method.
+      `chart` (M,) and `q` (M, d). Its M points are at equal times in one period, and begin at the
+      anchor. If `anchor` is no `Crossing`, they begin at any point of the cycle. JAX traces this
+      method.
     - `describe(i)` returns a name of section i for errors.
     """
 
@@ -372,7 +373,8 @@ class SectionList(AbstractSections):
     """Sections one by one. Where they are placed on a cycle, the first one stays section 0, and the
     others are sorted by the order in which the cycle meets them.
 
-    **Fields:** `items`: a list of `Crossing` and `AtEvent`, which the name of an event stands for.
+    **Fields:** `items`: a list of `Crossing` and `AtEvent`. The name of an event can replace its
+    `AtEvent`.
 
     **Example:**
 

@@ -121,12 +121,12 @@ def section_map(
     - `sections`: a family or `PlacedSections`.
     - `i`, `j`: indices of the first and the last section.
 
-    **Returns:** a `SectionMap`. Call it with `q` (n_i,), a state near section i of the cycle; `u`
-    (nu,), a constant input, Default: 0; `t`, the time at section i, Default: that of the cycle. Its
-    result has the time `t` and the state `q` (n_j,) at section j. The map can be differentiated,
-    jitted and vmapped. It raises `ComputationError` if section j is not reached within 100 periods,
-    or is reached in another chart than the cycle's. `fixed_point` is the cycle's state at section
-    i, `dims` are n_i and n_j.
+    **Returns:** a `SectionMap`. It is called with up to three arguments. `q` (n_i,): a state near
+    section i of the cycle. `u` (nu,): a constant input. Default: 0. `t`: the time at section i.
+    Default: that of the cycle. Its result has the time `t` and the state `q` (n_j,) at section j.
+    The map can be differentiated, jitted and vmapped. It raises `ComputationError` if section j is
+    not reached within 100 periods, or is reached in another chart than the cycle's. `fixed_point`
+    is the cycle's state at section i, `dims` are n_i and n_j.
 
     **Raises:** `DefinitionError` for an index out of range; `ComputationError` as `place_sections`.
 

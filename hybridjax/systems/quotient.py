@@ -43,8 +43,8 @@ class Symmetric(Derived):
 
     Of two charts that are mirror images of each other, one is left out. A transition into it leads
     into the other chart, and mirrors the state. A step is therefore a cycle, and two steps are a
-    stride. With S the symmetry and P the map of a step of `system`, the multipliers of a step are
-    those of S P, and those of the stride, (S P)^2, are their squares.
+    stride. Let S be the symmetry and P the map of a step of `system`. A step has the multipliers of
+    S P. A stride has those of (S P)^2, which are their squares.
 
     **Arguments:**
 
@@ -68,11 +68,11 @@ class Symmetric(Derived):
     Inputs act on the state in the charts that are kept, which is the mirrored one in every second
     step. With `half_period`, they act on the mirrored state in every second half of a cycle.
 
-    **Raises:** `DefinitionError` if charts or states do not fit together and, when a cycle or a
-    trajectory is computed, if a function does not have the symmetry; it names the function. A
-    derivative with respect to a parameter that breaks the symmetry (the stiffness of one leg)
-    raises an error, and so does, inside of `jit`, a system that is made there with such a
-    parameter.
+    **Raises:** `DefinitionError` if charts or states do not fit together. When a cycle or a
+    trajectory is computed, `DefinitionError` if a function does not have the symmetry; the message
+    names the function. A derivative with respect to a parameter that breaks the symmetry (the
+    stiffness of one leg) raises an error. A system that is made inside of `jit` with such a
+    parameter raises an error, too.
     """
 
     pairs: tuple[tuple[str, str], ...] = eqx.field(static=True)
@@ -232,7 +232,8 @@ class Symmetric(Derived):
         return outputs
 
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
-        """The picture of the original system, which stands at the translation 0 and moves."""
+        """Return the picture of the original system at the translation 0. Its
+        `velocity` is the speed of the translation."""
         whole = self.system.charts()[chart]
         still = dict.fromkeys(self.translation, 0.0)
         time = q["clock"] if self.charts()[chart].clocked else t

@@ -62,7 +62,7 @@ def simulate_recording(
     **Returns:** `hj.Recording` with S trials of inputs and outputs, in their units. A trial that
     fails ends there.
 
-    **Raises:** `DefinitionError` as `response_function`.
+    **Raises:** `DefinitionError` in the cases of `response_function`.
 
     **Example:**
 

@@ -112,7 +112,8 @@ class Design(Showable, eqx.Module):
         - `n_sections`: N. `periods`: P; every frequency must be a multiple of 1/P.
         - `inputs`: the number of inputs, or their names.
 
-        **Raises:** `DefinitionError` as `check` does, or for lists that do not fit together.
+        **Raises:** `DefinitionError` in the cases of `check`, and for lists that do not fit
+        together.
         """
         sizes = [np.size(f) for f in frequencies]
 

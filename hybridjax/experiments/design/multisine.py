@@ -221,11 +221,12 @@ def paper_design(
 ) -> Design:
     """Return the design of Ankarali & Cowan, Sec. VI-C: 620 frequencies in 80 random subsets.
 
-    The same as `multisine` with four times the experiments that it needs, without multiples of 1/2.
-    The paper's rules do not determine the subsets. By default they are also sum-free: the
-    second-order products of a subset do not fall on its own lines. At the paper's amplitude and on
-    kinematic sections, this divides the median (over 24 seeds) of the largest error of H_0 by 6 for
-    yM and 18 for vM, the maximum by 21 and 40 (`benchmarks/second_order.py`).
+    The design is a `multisine` without multiples of 1/2, in four times as many
+    experiments as necessary. The paper's rules do not determine the subsets. By default
+    they are also sum-free: the second-order products of a subset do not fall on its own
+    lines. This reduces the largest error of H_0 at the paper's amplitude and on
+    kinematic sections (24 seeds, `benchmarks/second_order.py`). Its median over the
+    seeds is divided by 6 for yM and by 18 for vM, its maximum by 21 and 40.
 
     **Arguments:**
 
@@ -235,7 +236,7 @@ def paper_design(
       "sum-free".
     - `experiments`: number of experiments. Default: 80.
 
-    **Raises:** `DefinitionError` as `multisine`.
+    **Raises:** `DefinitionError` in the cases of `multisine`.
 
     **Example:**
 

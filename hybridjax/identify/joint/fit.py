@@ -80,8 +80,8 @@ class LDTPFit(WithCost, MultiplierFit):
 
     - `model`: the fitted `LDTP`. The coordinates of its states are arbitrary; multipliers and HTFs
       do not depend on them, and have standard errors.
-    - `multipliers` (d,): by decreasing modulus, d the smallest dimension of any x[n].
-      `coefficients` (d,): of their polynomial.
+    - `multipliers` (d,): by decreasing modulus; d is the smallest dimension of any
+      x[n]. `coefficients` (d,): coefficients of the polynomial of the multipliers.
     - `covariance` (d, d): covariance of the coefficients, infinite if the data do not determine all
       of them. `covariance_dof` is infinite if variances were given. `standard_errors`, `contains`
       and `ellipse` follow from it.
@@ -97,12 +97,13 @@ class LDTPFit(WithCost, MultiplierFit):
       noise of the outputs; None for HTFs. `noise` (ny,): standard deviation of the errors one step
       ahead.
     - `findings`: "feedback" if a controller sets the inputs of time series, or may do so (only
-      without `references`); "drift" if a fit to the first 1000 cycles of time series, in which
-      outputs may drift, has other multipliers (outside of each other's confidence regions); "left
-      over" if residuals depend on the inputs; "process noise" or "colored noise" if residuals are
-      correlated in time; "misfit" if residuals of HTFs are larger than their variances, or similar
-      at neighboring frequencies, because the dimensions are too few or the iteration found a local
-      minimum; "order" if one dimension less explains the data; "undetermined"; "no convergence".
+      without `references`); "drift" if a second fit to the first 1000 cycles of time series, in
+      which outputs may drift, has other multipliers (they lie outside of each other's confidence
+      regions); "left over" if residuals depend on the inputs; "process noise" or "colored noise" if
+      residuals are correlated in time; "misfit" if residuals of HTFs are larger than their
+      variances, or similar at neighboring frequencies, because the dimensions are too few or the
+      iteration found a local minimum; "order" if one dimension less explains the data;
+      "undetermined"; "no convergence".
     """
 
     model: LDTP
@@ -284,17 +285,17 @@ def fit_ldtp(
       inputs (not with "innovations"). `findings`, and warnings (`FindingWarning`), report if one
       dimension less explains the data as well, if residuals of time series depend on the inputs,
       and if drift explains the multipliers. Default: True.
-    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
-      those that the controller sets. The fit is that of the plant, from these inputs to the
-      outputs, with innovations; the plant may be unstable. The fit is consistent if D is zero at
-      sections where the controller responds without delay, which the response of the outputs to the
-      reference shows. If the reference was not recorded, pass noise="innovations". Default: None.
+    - `references`: names of the inputs that enter a control loop from outside. The controller sets
+      the other inputs. The fit is a model of the plant, from the other inputs to the outputs, with
+      innovations. The plant may be unstable. The fit is consistent if D is zero at sections where
+      the controller responds without delay, which the response of the outputs to the reference
+      shows. If the reference was not recorded, pass noise="innovations". Default: None.
 
-    Without a reference, D is fixed to zero in three cases: outputs do not depend on inputs at the
-    same section; inputs depend on earlier residuals; or the past determines the inputs (few
-    excited frequencies) and a fit with D is not better (at 5 %). Otherwise D is fitted, and
-    a finding reports that a controller could cause the dependence. If the data do not determine
-    D, the printed fit reports this.
+    Without a reference, D is fixed to zero in three cases. First, outputs do not depend on inputs
+    at the same section. Second, inputs depend on earlier residuals. Third, the past determines the
+    inputs (few excited frequencies), and a fit with D is not better (at 5 %). Otherwise D is
+    fitted, and a finding reports that a controller could cause the dependence. If the data do not
+    determine D, the printed fit reports this.
 
     **Returns:** `hj.identify.LDTPFit`: `model`, the fitted `hj.linear.LDTP`; `multipliers` (d,),
     without unit, with `standard_errors` (d,) and `covariance` (d, d), that of their coefficients;

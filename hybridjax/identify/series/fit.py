@@ -124,11 +124,11 @@ class SeriesFit(MultiplierFit):
       by the records.
     - `references`: signals that enter the loop from outside. With them, `noise` is the standard
       deviation of $\chi y$.
-    - `findings`: "drift" if a fit to the first 1000 cycles, in which outputs may drift, and "order"
-      if a fit with one or two multipliers more has other multipliers (outside of each other's
-      confidence regions); "feedback" if inputs depend on earlier residuals, as those of a
-      controller do: the fit is then biased; "changing system" if the multipliers of earlier and
-      later cycles differ; "undetermined"; "no convergence".
+    - `findings`: "drift" if a fit to the first 1000 cycles, in which outputs may drift, has other
+      multipliers (outside of each other's confidence regions); "order" if a fit with one or two
+      multipliers more contradicts this fit in the same way; "feedback" if inputs depend on earlier
+      residuals, as with a controller, so that the fit is biased; "changing system" if the
+      multipliers of earlier and later cycles differ; "undetermined"; "no convergence".
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
@@ -242,7 +242,8 @@ class SeriesFit(MultiplierFit):
     def predicted(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "S T N ny"]:
-        """Return the outputs from the inputs, and from the starts and drift that fit best."""
+        """Return the outputs that follow from the inputs, with the initial conditions and the drift
+        that fit best."""
         N, R, ny, _ = self.numerators.shape
         T = grid.u.shape[1]
         v = divide_by_chi(self.coefficients, grid.u)
@@ -300,9 +301,9 @@ def fit_series(
       no input before. Default: "free".
     - `check`: whether to raise an error for an order that the data do not support, and to emit
       `findings` as warnings (`FindingWarning`). Default: True.
-    - `references`: names of the inputs that enter a control loop from outside. The other inputs are
-      those that the controller sets. The fit is that of the plant, stable or unstable, from these
-      inputs to the outputs, by instrumental variables, which are consistent for any noise and
+    - `references`: names of the inputs that enter a control loop from outside. The controller sets
+      the other inputs. The fit is a model of the plant, stable or unstable, from the other inputs
+      to the outputs. It uses instrumental variables, which are consistent for any noise and
       controller. `start` has no effect: the first cycles of each record are not used. Default:
       None.
 

@@ -194,7 +194,7 @@ class LoopEquations:
     def fit(self, check: bool) -> dict[str, Any]:
         """Return the fields of a `SeriesFit`.
 
-        **Raises:** `DefinitionError` as `solve`.
+        **Raises:** `DefinitionError` in the cases of `solve`.
         """
         c, covariance, noise = self.solve(check)
         N = len(self.sections)
@@ -224,7 +224,7 @@ class LoopEquations:
         )
 
     def coefficients(self) -> RoughFit:
-        """**Raises:** `DefinitionError` as `solve`."""
+        """**Raises:** `DefinitionError` in the cases of `solve`."""
         c, covariance, _ = self.solve(True)
         return c, lambda: covariance
 

@@ -134,8 +134,8 @@ class PreparedRecords:
     """
 
     def __init__(self, data: RecordedData, free_start: bool = False):
-        """**Raises:** `DefinitionError` as `uninterrupted_records`, and for inputs that are
-        zero and outputs that are constant at every sample, missing, or no deviations."""
+        """**Raises:** `DefinitionError` in the cases of `uninterrupted_records`, for inputs that
+        are zero, and for outputs that are constant at every sample, missing, or no deviations."""
         records = uninterrupted_records(data)
         if free_start:
             records = list(chain.from_iterable(map(_pieces, records)))

@@ -97,14 +97,16 @@ class PhaseResponse(PhaseCurve):
     - `p_flat`: probability of so much shape if the curve is flat (likelihood ratio; Self and Liang
       1987).
     - `excess`: variance of sums of residuals over blocks relative to that of independent errors.
-    - `intervals`: number of intervals. `miscounted`: number of those whose forecast is off by half
-      a cycle or more (an event was missed, or one was none); they are not used.
+    - `intervals`: number of intervals. `miscounted`: number of intervals whose forecast is off by
+      half a cycle or more, because an event was missed or a recorded event was none. They are not
+      used.
     - `memory`: correlation of the residuals of neighboring intervals, beyond a wandering rate.
-    - `carried`: effect of a push on the next interval, as part of the effect on its own, which the
-      curve shows; `carried_error` is its standard error.
-    - `wander`: standard deviation of the rate within a trial, as part of the rate, beyond jitter.
-      `wander_time`: time after which it is forgotten, in s.
-    - `within`: fraction of the input's variance that lies within intervals; small if it is slow.
+    - `carried`: effect of a push on the next interval, divided by its effect on its own interval,
+      which the curve shows. `carried_error` is its standard error.
+    - `wander`: standard deviation of the rate within a trial, divided by the rate, beyond jitter.
+      `wander_time`: correlation time of these changes, in s.
+    - `within`: fraction of the input's variance that lies within intervals. It is small for a slow
+      input.
     - `result`: `Result.OK` if the fit converged.
     """
 
@@ -191,7 +193,7 @@ class PhaseResponse(PhaseCurve):
 
         **Returns:** `hj.recordings.IntervalForecast`.
 
-        **Raises:** `DefinitionError` as `phase_response`.
+        **Raises:** `DefinitionError` in the cases of `phase_response`.
 
         **Example:**
 
@@ -276,9 +278,10 @@ def phase_response(
       (`hj.Recording.from_frame`).
     - `sections`: the event at which each cycle begins, by its name, or a `Phase` estimated from
       events or crossings.
-    - `input`: the name of the signal that acted; linear between its samples. It must not depend on
-      the rhythm (no feedback). The curve and the rates are those of the rhythm under the mean of
-      this signal in each trial.
+    - `input`: the name of the input signal. It is interpolated linearly between its
+      samples, and must not depend on the rhythm (no feedback). The mean of the signal
+      in each trial counts as a part of the rhythm: the curve and the rates are those of
+      the rhythm under this constant input.
 
     **Returns:** `hj.recordings.PhaseResponse`: `values` and `errors` (P,), in cycles per second and
     unit of the input, at the phases `phase` (P,) in cycles; `rates` (trials,), in cycles per

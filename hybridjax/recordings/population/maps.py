@@ -75,9 +75,9 @@ class MapResult(Showable):
     def plot(self, *, ax: object = None) -> Any:
         """Draw the mean or difference over subjects.
 
-        A curve: each subject as a thin line, the mean, its band, and the significant points (bar).
-        A map: its values, with outlined significant points. Of complex values, the magnitude is
-        drawn.
+        For a curve, the figure shows each subject as a thin line, the mean with its band, and a bar
+        at the significant points. For a map, it shows the values, with outlined significant points.
+        For complex values, it shows the magnitude.
 
         **Arguments:** `ax`: one Axes. Default: a new figure.
 
@@ -127,7 +127,8 @@ class PopulationMaps:
       stacked by `np.stack`.
     - `axes`: coordinates by name, in the order of the grid. `unit` of the values. Default: none.
 
-    **Raises:** `DefinitionError` for shapes that do not fit together, and as `Population`.
+    **Raises:** `DefinitionError` for shapes that do not fit together, and in the cases of
+    `Population`.
 
     **Example:**
 

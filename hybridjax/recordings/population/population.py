@@ -120,13 +120,13 @@ class Population(Showable):
     ) -> "Population":
         """Return the population of some fits, with a row of the table for each.
 
-        The names of the subjects alone, `from_fits(fits, ["S1", "S2"])`, or fits by name,
-        `from_fits({"S1": fit, "S2": other})`, stand for a table.
+        Instead of a table, pass the names of the subjects, `from_fits(fits, ["S1", "S2"])`, or fits
+        by name, `from_fits({"S1": fit, "S2": other})`.
 
-        Quantities are `modulus` and `angle` (rad; missing if real) of the leading multiplier, its
-        `decay` (the rate -ln(modulus) per stride: half of a deviation is left after
-        ln(2) / decay strides; negative if it grows), and the coefficients `c1`, `c2`, ... of the
-        characteristic polynomial (missing in fits of lower order).
+        Quantities are the `modulus` and the `angle` (in rad, missing if real) of the leading
+        multiplier, its `decay`, and the coefficients `c1`, `c2`, ... of the characteristic
+        polynomial (missing in fits of lower order). `decay` is the rate -ln(modulus) per stride:
+        half of a deviation is left after ln(2) / decay strides. It is negative if deviations grow.
 
         **Raises:** `DefinitionError` for a fit without covariance, and outputs or units that
         differ.
@@ -201,11 +201,12 @@ class Population(Showable):
     def mean(self, quantity: str, *, covariates: OptionalNames = ()) -> Any:
         """Return the mean over subjects, and the spread between them, in each group and condition.
 
-        Intervals of the mean, and of the slopes of covariates, are those of Hartung and Knapp
-        (2001, 2003); those of the spread (a standard deviation, without the errors of the
-        estimates) follow from the Q profile (Viechtbauer 2007). They assume normal subjects: a
-        warning (`FindingWarning`) reports others (Shapiro and Wilk 1965). With covariates, the mean
-        is that at the mean of each covariate.
+        Intervals of the mean, and of the slopes of covariates, are those of Hartung and
+        Knapp (2001, 2003). The spread is a standard deviation, without the errors of
+        the estimates; its intervals follow from the Q profile (Viechtbauer 2007). All
+        intervals assume that the values of the subjects have a normal distribution. A
+        warning (`FindingWarning`) reports values that do not (Shapiro and Wilk 1965).
+        With covariates, the mean is that at the mean of each covariate.
 
         **Raises:** `DefinitionError` for an unknown quantity or covariate, and for too few
         subjects.
@@ -256,7 +257,8 @@ class Population(Showable):
 
         **Arguments:** `covariates`: columns with common slopes. Default: none.
 
-        **Raises:** `DefinitionError` as `mean`, and for labels that the table does not have.
+        **Raises:** `DefinitionError` in the cases of `mean`, and for labels that are not in the
+        table.
         """
         data, cell, w, pairs = self._contrast(quantity, a, b, covariates)
         subject, _ = data["subject"].factorize()
@@ -285,13 +287,14 @@ class Population(Showable):
         )
 
     def predictions(self, quantity: str) -> Any:
-        """Return the best linear unbiased prediction of each subject: its estimate, shrunken
-        towards the mean of its group and condition the more, the larger its error.
+        """Return the best linear unbiased prediction of each subject. It is the
+        estimate, shrunken towards the mean of its group and condition; a larger error
+        shrinks it more.
 
         Standard errors contain those of the mean and of the variance between subjects (Prasad and
         Rao 1990).
 
-        **Raises:** `DefinitionError` as `mean`; three subjects are needed.
+        **Raises:** `DefinitionError` in the cases of `mean`; three subjects are needed.
         """
         parts = []
         for _, data in self._cells(quantity, 3):
@@ -334,9 +337,10 @@ class Population(Showable):
         """Return the power of 5 % tests of a difference, by simulation of populations like this
         pilot.
 
-        Simulated subjects have the spread of the pilot, and standard errors drawn from its own.
-        With `labels` of two conditions the test is that of paired differences; without labels, that
-        of two groups of the pilot's spread, with `subjects` in each.
+        Simulated subjects have the spread of the pilot, and standard errors drawn from
+        those of the pilot. If `labels` are two conditions, the test is for paired
+        differences. Without labels, it compares two groups with `subjects` in each, and
+        both have the spread of the pilot.
 
         **Arguments:** `difference`: true difference, in units of the quantity. `subjects`: their
         numbers. `draws`: number of simulated populations.
@@ -344,7 +348,7 @@ class Population(Showable):
         **Returns:** power at the pilot's spread, with a 95 % interval that contains the error of
         the simulation and the interval of the spread.
 
-        **Raises:** `DefinitionError` as `difference`, and if xarray is not installed.
+        **Raises:** `DefinitionError` in the cases of `difference`, and if xarray is not installed.
         """
         if len(labels) == 2:
             pilots = [self._contrast(quantity, *labels)[-1]]
