@@ -2,14 +2,16 @@
 
 `find_limit_cycles` is the public function, and `solved` divides the work. In a large sweep, systems
 first follow the *itineraries* of known cycles, that is, their recorded sequences of steps and
-events (`many.py`). Systems that leave these itineraries, and all systems of a small sweep, are
+events (`many.py`). Systems that leave these itineraries, and those of the first small sweeps, are
 solved from the cycles of their neighbors by Newton's method with a search for events
 (`batches.py`). `examined` then tests events that coincide, and checks eight cycles by a second
 integration (all cycles, if one of the eight has a fault). If a cycle of a sweep differs from a
 search for it alone, compare these two ways.
 """
 
+import collections
 import dataclasses
+import time
 from collections.abc import Sequence
 from typing import Any, SupportsIndex
 
@@ -18,9 +20,10 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
+from .._core import compilation
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
-from .._core.compilation import at_ease
+from .._core.compilation import at_ease, identity
 from .._core.execution import Execution
 from .._core.executor import from_host, to_host
 from .._core.meaning import current_of_many, first_of
@@ -57,6 +60,8 @@ _LOOKED_AT = 50
 # Number of systems from which on programs that follow itineraries are worth their compilation.
 # Fewer: a sweep waits for the compiler. More: sweeps without such programs take longer.
 WORTH_COMPILING = 250
+# CPU seconds that small sweeps have spent on searches, by class of systems.
+_searching: collections.Counter = collections.Counter()
 # Number of turns (returns to the section) that are simulated before a search, to find the chart in
 # which the cycle begins. More: hopeless searches last longer. Fewer: cycles that begin in another
 # chart are lost.
@@ -201,11 +206,11 @@ def find_limit_cycles(
     that of a neighboring system, which a search has found. Each cycle is integrated
     again, by another method with other steps.
 
-    Fewer systems, and systems that leave all itineraries, are searched in parallel
-    rounds. The first round has a few systems and starts from the guess. Each further
-    round has four times as many systems, and starts from cycles of neighbors. If
+    Fewer systems, and systems that leave all itineraries, are searched side by side. The
+    first 256 start from the guess, the others from the cycles of their neighbors. If
     Newton's method fails for a system, the system is simulated for 8 or 40 periods, and
-    Newton's method starts again from the final state.
+    Newton's method starts again from the final state. Once searches have taken as long as
+    it takes to compile the program, all further sweeps of the class use the program.
 
     **Arguments:**
 
@@ -269,8 +274,15 @@ def solved(
     """
     S = len(leaves_of(systems)[0])
     tiles = tiles_of(systems, map, size, workers)._replace(known=known)
-    if S < WORTH_COMPILING or not checked or not has_route(map):
+    if not checked or not has_route(map):
         return as_cycles(tiles, tiles.solve(S))
+    kind = identity((map,))
+    # (Once searches have taken as long as compilation does, it is likely that more sweeps follow.)
+    if S < WORTH_COMPILING and _searching[kind] < compilation.WORTH_COMPILING:
+        begin = time.process_time()
+        rounds = tiles.solve(S)
+        _searching[kind] += time.process_time() - begin
+        return as_cycles(tiles, rounds)
     expected = np.full(S, float(map.expected))
     expected = expected if tiles.periods is None else tiles.periods
     times = np.full(S, float(tiles.map.anchor.t[0]))

@@ -1,5 +1,6 @@
 """Cycles that follow the itinerary of a known one: as the search finds them, or not at all."""
 
+import collections
 import dataclasses
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import hybridjax as hj
+from hybridjax._core import compilation
 from hybridjax.orbits import batches, find, limit_cycles, near
 from hybridjax.orbits.repeat import Maps, Plan, correct, leaves_of, on_device
 
@@ -225,6 +227,22 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
         found = cycles.multipliers[i][: len(alone.multipliers)]
         expected = np.sort(alone.multipliers)
         assert np.allclose(np.sort(found), expected, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_small_sweeps_follow_the_itinerary_after_long_searches(free, monkeypatch):
+    """They are searched at first, since compiling takes longer than a few searches."""
+    drives = [0.25, 0.3, 0.35]
+    systems = [Rebound(drive=x) for x in drives]
+    monkeypatch.setattr(limit_cycles, "_searching", collections.Counter())
+    searched = hj.orbits.find_limit_cycles(systems, free)
+
+    monkeypatch.setattr(compilation, "WORTH_COMPILING", 0.0)
+    monkeypatch.setattr(batches.Tiles, "solve", None)
+    followed = hj.orbits.find_limit_cycles(systems, free)
+
+    assert searched.ok.all() and followed.ok.all()
+    assert_allclose(followed.anchor.q, searched.anchor.q, rtol=1e-8)
 
 
 def test_programs_of_many_systems_factorize_nothing(free):
