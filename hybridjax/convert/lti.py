@@ -26,7 +26,7 @@ from ..linear.ldtp import LDTP
 from ..orbits.continuous_htf import asked, linear_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import hosted, linear_flow, rule
-from ..systems.system import OutputNames
+from ..systems.system import OutputNames, name_of
 
 
 @checked
@@ -229,7 +229,7 @@ def to_harmonic_state_space(
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
     if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
         raise DefinitionError(
-            f"{type(s.system).__name__} has events at which deviations jump, which no finite "
+            f"{name_of(s.system)} has events at which deviations jump, which no finite "
             "number of harmonics represents: use `cycle.htf` (exact)."
         )
     _, by_state, by_input = linear_outputs(s, flow, z)

@@ -30,7 +30,7 @@ from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
 from ..sections.linearization import linearize
-from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
+from ..systems.system import HybridSystem, arrays_of, name_of, unit_of_parameter
 from .problem import DELAYS, FALSE_ALARMS, FitProblem, of_system, tail_of
 
 
@@ -474,7 +474,7 @@ class ModelFit(ParameterFit):
         return ParameterEstimate(
             names=self.names,
             units=self.units,
-            system=type(self.system).__name__,
+            system=name_of(self.system),
             values=np.asarray(self.values),
             covariance=np.asarray(self.covariance),
             unseen=np.asarray(self.unseen),
@@ -548,7 +548,7 @@ class ModelFit(ParameterFit):
 
     def _summary(self) -> str:
         lines = [
-            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
+            f"ModelFit({name_of(self.system)}: {Result(self.result).message})",
             self._cost(),
             "standard errors include noise, but no distortion:",
             *self._table(),
@@ -603,5 +603,5 @@ class ModelFit(ParameterFit):
         parameters = table(
             ("parameter", "value", "standard error", "unit"), self.rows()
         )
-        of = f"of {type(self.system).__name__}: {Result(self.result).message}"
+        of = f"of {name_of(self.system)}: {Result(self.result).message}"
         return of, parameters, text(self._cost())

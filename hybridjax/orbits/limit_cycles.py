@@ -33,7 +33,13 @@ from .._core.text import folded
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
+from ..systems.system import (
+    HybridSystem,
+    arrays_of,
+    copies_of,
+    name_of,
+    require_positive,
+)
 from .batches import Known, Rounds, Tiles, in_lanes, numbers_of, tiles_of
 from .checks import check_found, check_periodic
 from .coincidence import commutes
@@ -180,7 +186,7 @@ class LimitCycles(Showable, eqx.Module):
         return folded("; ".join(text))
 
     def __repr__(self):
-        kind = type(self.systems).__name__
+        kind = name_of(self.systems)
         return folded(f"LimitCycles({kind}: {self.summary(1)})")
 
 
@@ -531,7 +537,7 @@ def _stacked(systems) -> HybridSystem:
     first, *_ = [systems] if isinstance(systems, HybridSystem) else [*systems, None]
     if first is not None and not arrays_of(first):
         raise DefinitionError(
-            f"{type(first).__name__} has no parameters, in which systems could differ: use "
+            f"{name_of(first)} has no parameters, in which systems could differ: use "
             "`find_limit_cycle` for the one that there is."
         )
     if isinstance(systems, HybridSystem):

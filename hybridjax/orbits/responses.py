@@ -48,6 +48,7 @@ from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
 from ..systems.surfaces import SlidingChart
+from ..systems.system import name_of
 from .crossing import to_section
 from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
@@ -342,7 +343,7 @@ class Responses(Showable, eqx.Module):
         return Coupling(c)
 
     def __repr__(self):
-        name = type(self.structure.system).__name__
+        name = name_of(self.structure.system)
         if is_traced(self):
             return f"Responses({name}, traced)"
         kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
@@ -374,7 +375,7 @@ class Responses(Showable, eqx.Module):
         if mode is None:
             if self.of_phase is None:
                 raise DefinitionError(
-                    f"{type(self.structure.system).__name__} has no phase response: its phase is "
+                    f"{name_of(self.structure.system)} has no phase response: its phase is "
                     "that of its clock; use `amplitude`."
                 )
             return self.of_phase

@@ -28,6 +28,7 @@ from ..engine.lanes import nan_where
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
+from ..systems.system import name_of
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike, followed_at_once
 
@@ -70,7 +71,7 @@ class SectionMap(Showable, eqx.Module):
     """Dimensions n_i and n_j."""
 
     def __repr__(self):
-        system = type(self.placed.cycle.system).__name__
+        system = name_of(self.placed.cycle.system)
         states = how_many(self.dims[0], "state", "states")
         ends = " to ".join(map(self.placed.family.describe, (self.i, self.j)))
         return folded(f"SectionMap({system}: from {ends}; {states} to {self.dims[1]})")
