@@ -367,11 +367,11 @@ class _Moves:
         return lambda t, q: field(t, q, u)
 
     def _has_level(self, a: int) -> bool:
-        return self.levels is not None and self.levels.present(self.s, a)
+        return kernels.has_level(self.s, a, self.levels)
 
     def _functions(self, a: int) -> int:
         """Number of watched functions."""
-        return len(self.s.guards(a)) + self._has_level(a)
+        return kernels.count_watched(self.s, a, self.levels)
 
     def _unknown(self, lanes: int):
         """Placeholders for watched functions and their rates, before any is evaluated."""

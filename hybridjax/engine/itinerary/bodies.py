@@ -34,6 +34,7 @@ from jaxtyping import Float
 from ...systems.structure import Kind, Member, Structure
 from ...systems.transition import SAME_TIME, Scheduled
 from ..arrays import Array
+from ..kernels import count_watched
 from . import steps
 from .course import Constants, Course, Travelers, padded_like
 from .flags import (
@@ -49,7 +50,6 @@ from .rows import JUMP, LEVEL, NOTHING, SCHEDULE, STEP, TIME, Body, Form
 from .table import Row
 from .watched import (
     Watched,
-    count_watched,
     watched_values,
     with_predicates,
 )

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..._core.lanes import shared
 from ...systems.structure import Structure
 from .. import kernels
 from ..lanes import IDLE, Lanes, Tape
@@ -124,7 +123,7 @@ def _signs(s: Structure, levels, t, chart, q, section) -> Int[np.ndarray, "M G"]
 
     **Arguments:** `section` (M,): index of the level that is watched.
     """
-    counts = [len(s.guards(a)) + _has_level(s, a, levels) for a in range(len(s.dims))]
+    counts = [kernels.count_watched(s, a, levels) for a in range(len(s.dims))]
     signs = np.zeros((len(t), max(counts)), int)
     for a in np.unique(chart).tolist():
         count = counts[a]
@@ -134,15 +133,15 @@ def _signs(s: Structure, levels, t, chart, q, section) -> Int[np.ndarray, "M G"]
         state = q[: s.dims[a], here]
         no_input = np.zeros((s.nu, 1))
         watched = kernels.watched(s, a, levels, t[here], state, no_input, section[here])
-        value = np.nan_to_num(watched[:, 0], posinf=np.inf, neginf=-np.inf)
-        magnitude = np.abs(value)
-        finite = np.where(np.isfinite(value), magnitude, 0.0)
-        largest = finite.max(axis=1, keepdims=True)
-        is_known = magnitude > _NEAR_ZERO * largest
-        sign = np.where(is_known, np.sign(value), 0)
-        signs[here, :count] = sign.T
+        signs[here, :count] = known_signs(watched[:, 0]).T
     return signs
 
 
-def _has_level(s: Structure, a: int, levels: AbstractLevels | None) -> bool:
-    return levels is not None and shared(levels).present(s, a)
+def known_signs(values: Float[np.ndarray, "G M"]) -> Int[np.ndarray, "G M"]:
+    """Signs of functions at M points; 0 where a function is NaN, or zero but for errors."""
+    values = np.nan_to_num(values, posinf=np.inf, neginf=-np.inf)
+    sizes = np.abs(values)
+    finite = np.where(np.isfinite(values), sizes, 0.0)
+    largest = finite.max(axis=1, keepdims=True)
+    is_known = sizes > _NEAR_ZERO * largest
+    return np.where(is_known, np.sign(values), 0).astype(int)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 
 from ...systems.solver import Method
 from ...systems.structure import Structure
-from ..runge_kutta import StageEquations, errors, increments
+from ..runge_kutta import StageEquations, errors, increments, with_derivatives
 
 
 # Change at which Newton's method for the stages of a state ends, relative to its size. Larger: two
@@ -138,9 +138,6 @@ def implicit_step(
        gives the increments their first derivatives in directions from outside, by the implicit
        function theorem.
     """
-    A = np.array(method.a)
-    b = np.array(method.b)
-    c = np.array(method.c)
 
     # (`runge_kutta.py` has lanes on the last axis. Here, the only lane is the state.)
     def field_of_lane(t, q):
@@ -156,19 +153,14 @@ def implicit_step(
 
     # From here on, the state and its columns take the place of lanes, on the last axis.
     def rates_of_stage(t, stage):
-        return rates(s, a, t, stage.T, inputs).T
-
-    def residual(w):
-        stages = y.T + jnp.tensordot(A, w, 1)
-        return h * jax.vmap(rates_of_stage)(t + c * h, stages) - w
+        return rates(s, a, t[0], stage.T, inputs).T
 
     columns = len(y) - 1
     no_increments = jnp.zeros((*near.shape[:2], columns))
     w = jnp.concatenate([near, no_increments], axis=2)
-    for _ in range(2):
-        change = equations.solve(residual(w))
-        w = w + change
-    end = y + jnp.tensordot(b, w, 1).T
+    start = t[None], y.T, h[None]
+    w, change = with_derivatives(method, rates_of_stage, start, equations, w)
+    end = y + jnp.tensordot(np.array(method.b), w, 1).T
 
     last_change = jnp.max(jnp.abs(change[..., :1]), axis=0)
     of_state = jax.lax.stop_gradient((w[..., :1], last_change))

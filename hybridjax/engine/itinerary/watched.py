@@ -56,11 +56,6 @@ def watched_values(
     return watched_at(a, kinds, s, levels, t, q, u, row.section)
 
 
-def count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
-    has_level = levels is not None and levels.present(s, a)
-    return len(s.guards(a)) + has_level
-
-
 def with_predicates(
     a: int, s: Structure, before: Watched, now: Watched, fields: tuple
 ) -> Watched:
