@@ -228,7 +228,8 @@ def to_harmonic_state_space(
 
     **Before:** `hj.find_limit_cycle`.
     """
-    exact = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs).H.swapaxes(0, 1)
+    htf = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs)
+    exact = np.asarray(htf.H).swapaxes(0, 1)
     linear = _linearized(cycle, order or _ORDERS[-1], outputs, inputs)
     for n in _ORDERS if order is None else (order,):
         space = _truncated(linear, n)

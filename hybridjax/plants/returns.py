@@ -654,7 +654,7 @@ def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
     """Return the indices of eigenvalues that differ from 0, the largest first. Of a conjugate pair,
     both or none are listed."""
     differs = np.abs(found.value) > _RESOLVED * found.error
-    for i in np.flatnonzero(differs):
+    for i in np.flatnonzero(differs).tolist():
         differs[i] = differs[i] and differs[conjugate_of(found.value, i)]
     rows = np.flatnonzero(differs)
     return rows[largest_first(found.value[rows])]

@@ -128,7 +128,7 @@ def test_what_is_no_symmetry_is_refused(system, symmetry, message):
 
 def test_messages_name_the_system_that_the_user_wrote():
     def field(t, q):
-        return q[1], -q[0] ** 3
+        return q[1], -(q[0] ** 3)
 
     mine = hj.HybridSystem.from_functions(("x", "v"), field, name="Mine")
     folded = hj.systems.Symmetric(mine, flipped=("x", "v"), half_period="x")
