@@ -231,7 +231,8 @@ def to_harmonic_state_space(
     htf = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs)
     exact = np.asarray(htf.H).swapaxes(0, 1)
     linear = _linearized(cycle, order or _ORDERS[-1], outputs, inputs)
-    for n in _ORDERS if order is None else (order,):
+    orders = _ORDERS if order is None else (order,)
+    for n in orders:
         space = _truncated(linear, n)
         error = _error_of(space, exact, linear.period)
         if order or error < tolerance:

@@ -85,7 +85,8 @@ class Identifiability(Showable, eqx.Module):
     def __repr__(self) -> str:
         nonzero = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
         lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
-        names, p = ", ".join(self.names), len(self.names)
+        names = ", ".join(self.names)
+        p = len(self.names)
         lines = [
             f"Identifiability: {self.rank} of {p} combinations of ({names}) are identified"
         ]
@@ -256,11 +257,13 @@ class ParameterFit(WithCost, Fit):
             )
         else:
             given = true
-        if more := [name for name in given if name not in self.names]:
+        more = [name for name in given if name not in self.names]
+        if more:
             raise DefinitionError(
                 f"the other values have another '{more[0]}', which was not fitted: free it."
             )
-        if missing := [name for name in self.names if name not in given]:
+        missing = [name for name in self.names if name not in given]
+        if missing:
             raise DefinitionError(
                 f"the other values lack '{missing[0]}', which was fitted."
             )

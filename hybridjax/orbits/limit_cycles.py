@@ -300,7 +300,8 @@ def solved(
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
     together = _coincide(cycles, solver, tiles.map)
-    if len(left := solver.left):
+    left = solver.left
+    if len(left):
         near = _some_known(cycles) if known is None else known
         part = tiles_of(_some(systems, left), map, size, workers)
         rounds = part._replace(known=near).solve(len(left))
@@ -350,7 +351,8 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         rows = np.flatnonzero(found.path == path)
         if not len(rows):
             continue
-        chart[rows], events[rows] = itinerary.charts, itinerary.begins
+        chart[rows] = itinerary.charts
+        events[rows] = itinerary.begins
         armed[rows] = itinerary.armed
         more = np.full((S, len(itinerary.events)), -1)
         more[rows] = itinerary.events

@@ -221,13 +221,13 @@ class Responses(Showable, eqx.Module):
 
         **Raises:** `DefinitionError` for a cycle that is driven by a clock.
         """
-        scale = {
+        require_as_made(self.structure.system, _MADE)
+        scales = {
             "time": 1.0,
             "cycles": 1 / self.period,
             "radians": 2 * np.pi / self.period,
-        }[unit]
-        require_as_made(self.structure.system, _MADE)
-        return self._named(self._covector(None), phase, scale)
+        }
+        return self._named(self._covector(None), phase, scales[unit])
 
     def amplitude(self, mode: Index, phase: Phases) -> dict[str, Inexact[Array, " p"]]:
         """Change of the amplitude of a mode after a brief push at some phases, by names of states
@@ -457,7 +457,8 @@ def asymptotic_phase(
     period = float(cycle.period)
     s = map.structure
     a = map.structure.chart_index(chart)
-    lanes = begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
+    begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
+    lanes = begin
     phase = responses(cycle, 0)._covector(None)[0, 0]
     size = map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase

@@ -202,7 +202,8 @@ class Bodies:
 
         On a section, the first one is that of the time: who begins later is behind by the flow.
         """
-        C, d = len(course.y) - 1, course.y.shape[1]
+        C = len(course.y) - 1
+        d = course.y.shape[1]
         delay = jnp.zeros(C)
         if self.inputs is None:
             unit = jnp.eye(C, d)

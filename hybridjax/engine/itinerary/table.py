@@ -63,7 +63,8 @@ def read(one: Table) -> Row:
 
 def tabulated(s: Structure, form: Form, rows: Rows) -> Table:
     """The rows of an itinerary for its program."""
-    ways, kinds = form.ways, form.kinds
+    ways = form.ways
+    kinds = form.kinds
     chart = {a: k for k, a in enumerate(form.charts)}
 
     # (In the order of the fields of `Row`.)

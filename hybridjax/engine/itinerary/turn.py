@@ -176,7 +176,8 @@ class _Steps:
         by_ended = columns.begun.ended(row, columns.course, 1)
         both = state.course, columns.course
         (course, by_course), flags = self._bodies.take(motion, row, both, flags)
-        begun, by_begun = ended.begun(row, course), by_ended.begun(row, by_course, 1)
+        begun = ended.begun(row, course)
+        by_begun = by_ended.begun(row, by_course, 1)
         return _State(course, begun), _State(by_course, by_begun), flags
 
     def row(self, constants: Constants, row: Row, state: "_State", flags: Flags):
