@@ -245,7 +245,7 @@ def _implicit_step(
     stages. They change the stages by rounding errors only, but give them their first and second
     derivatives (implicit function theorem).
     """
-    start = [jax.lax.stop_gradient(x) for x in (t, q, h)]
+    start = jax.lax.stop_gradient((t, q, h))
     w, left, J = increments(method, still or field, *start)
     if still is not None:
         equations = StageEquations.at(method, still, *start, w)

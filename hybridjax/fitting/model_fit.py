@@ -134,17 +134,25 @@ def _rounded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
 
 
 def _describe(names: tuple[str, ...], row: Float[np.ndarray, " p"]) -> str:
-    parts = [(name, w) for name, w in zip(names, row, strict=True) if w]
-    if len(parts) == 1:
-        return parts[0][0]
-    together = ", ".join(name for name, _ in parts)
-    if all(w == parts[0][1] for _, w in parts):
-        only = f", only {parts[0][0]}/{parts[1][0]}" if len(parts) == 2 else ""
-        return f"a common factor of ({together}){only}"
-    if len(parts) == 2 and parts[0][1] == -parts[1][1]:
-        return f"{parts[0][0]} and {parts[1][0]} apart, only their product"
-    powers = ", ".join(name if w == 1 else f"{name}^{w:.3g}" for name, w in parts)
-    return f"a common factor, with these powers, of ({powers})"
+    """An unidentifiable combination in words, from its relative change of each parameter."""
+    places = np.flatnonzero(row)
+    moved = [names[k] for k in places]
+    power = row[places]
+    first = moved[0]
+    if len(moved) == 1:
+        return first
+    last = moved[-1]
+    together = ", ".join(moved)
+    if np.all(power == power[0]):
+        if len(moved) == 2:
+            return f"a common factor of ({together}), only {first}/{last}"
+        return f"a common factor of ({together})"
+    if len(moved) == 2 and power[0] == -power[1]:
+        return f"{first} and {last} apart, only their product"
+    powers = []
+    for name, x in zip(moved, power, strict=True):
+        powers.append(name if x == 1 else f"{name}^{x:.3g}")
+    return f"a common factor, with these powers, of ({', '.join(powers)})"
 
 
 @leading_on
