@@ -1,7 +1,8 @@
 """The rows of an itinerary, as data: what happens, in which order.
 
-A *leg* is the part of a trajectory between two events (see `legs.py`). A bouncing ball from apex to
-apex has two legs, with the section (its apex) as the second watched function beside its guard:
+A *leg* is the part of a trajectory between two events (see `legs.py`). A ball that bounces without
+loss, from apex to apex, has two legs. Its watched functions are the guard, number 0, and the level
+of the section, number 1. In four steps, each of which begins a piece, the rows are
 
 | row | body: does, chart | leg | fraction | target | piece |
 |---|---|---|---|---|---|
@@ -16,8 +17,8 @@ apex has two legs, with the section (its apex) as the second watched function be
 
 The end of a leg is not known exactly, so that each step takes a fraction of its leg. *Corrections*
 follow: steps of the length that brings a watched function to zero, which is Newton's method for the
-time of the event. JUMP and LEVEL end with the last one. SCHEDULE comes before the steps of a leg
-that ends by the clock, and TIME ends a leg at a time that is known.
+time of the event. JUMP and LEVEL begin with a last correction, by Euler's method. SCHEDULE comes
+before the steps of a leg that ends by the clock, and TIME ends a leg at a time that is known.
 """
 
 from typing import NamedTuple
