@@ -1,7 +1,15 @@
-"""Periodic systems as time-invariant ones: lifted, with samples of whole periods; harmonic.
+"""Periodic systems as time-invariant ones, for tools that know no periods.
 
-Lifting (Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2) stacks the inputs and outputs of
-all sections of a period.
+| from | to | by |
+|---|---|---|
+| `LDTP`, N sections | one step for each period: signals of all sections are stacked | `to_lti` |
+| the same | objects of python-control and scipy | `to_control`, `to_scipy` |
+| `HTF` | frequency responses of python-control | `to_control` |
+| `LimitCycle` | harmonics of states, inputs and outputs | `to_harmonic_state_space` |
+
+Lifting is in Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2. The harmonic state space is
+truncated, with an error that is measured against `LimitCycle.htf` (`_error_of`); the others are
+exact.
 """
 
 import itertools
@@ -10,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Complex
+from jaxtyping import Complex, Float
 
 from .._core.arguments import package
 from .._core.boundary.checked import checked
@@ -26,7 +34,16 @@ from ..linear.ldtp import LDTP
 from ..orbits.continuous_htf import asked, linear_outputs
 from ..orbits.cycle import LimitCycle
 from ..orbits.linear_flow import hosted, linear_flow, rule
-from ..systems.system import OutputNames
+from ..systems.system import OutputNames, name_of
+
+
+# Orders that are tried, and frequencies of the comparison, in cycles per period. More:
+# calls take longer. Fewer: an error between them is not seen.
+_ORDERS = 2, 4, 8, 16, 32, 64
+_TRIED = np.array([0.13, 0.37, 0.5])
+# Deviations jump at an event if they change by more than this part of their sizes. Larger: jumps
+# are left out. Smaller: rounding counts as a jump.
+_NO_JUMP = 1e-9
 
 
 @checked
@@ -175,12 +192,6 @@ class HarmonicStateSpace(NamedTuple):
         return H.reshape(len(rates), M, ny, D.shape[-1])
 
 
-# Orders that are tried, and frequencies of the comparison, in cycles per period. More:
-# calls take longer. Fewer: an error between them is not seen.
-_ORDERS = 2, 4, 8, 16, 32, 64
-_TRIED = np.array([0.13, 0.37, 0.5])
-
-
 @checked
 def to_harmonic_state_space(
     cycle: LimitCycle,
@@ -218,51 +229,90 @@ def to_harmonic_state_space(
     **Before:** `hj.find_limit_cycle`.
     """
     htf = cycle.htf(_TRIED, (-1, 0, 1), outputs, inputs)
-    exact = htf.H.swapaxes(0, 1)
+    exact = np.asarray(htf.H).swapaxes(0, 1)
+    linear = _linearized(cycle, order or _ORDERS[-1], outputs, inputs)
+    orders = _ORDERS if order is None else (order,)
+    for n in orders:
+        space = _truncated(linear, n)
+        error = _error_of(space, exact, linear.period)
+        if order or error < tolerance:
+            return space._replace(error=error)
+    raise ComputationError(f"order {n} has the error {error:.1e}: set `order`.")
+
+
+class _Linearized(NamedTuple):
+    """The linearization of a cycle in continuous time, at k nodes in each of p pieces."""
+
+    period: float
+    angles: Float[np.ndarray, "p k"]
+    """2 pi times the phases of the nodes."""
+    weights: Float[np.ndarray, "p k"]
+    """Weights of the nodes in a mean over the period."""
+    A: Float[np.ndarray, "p k d d"]
+    B: Float[np.ndarray, "p k d nu"]
+    C: Float[np.ndarray, "p k ny d"]
+    D: Float[np.ndarray, "p k ny nu"]
+
+
+def _linearized(
+    cycle: LimitCycle,
+    order: int,
+    outputs: OutputNames | None,
+    inputs: SignalNames | None,
+) -> _Linearized:
+    """The linearization, at nodes that are dense enough for harmonics up to an order.
+
+    **Raises:** `DefinitionError` for cycles with events at which deviations jump.
+    """
     map = hosted(cycle).return_map
     s = map.structure
-    period = map.expected
     z, _, columns = asked(s, cycle.event_sequence, outputs, inputs)
-    flow = linear_flow(cycle, 0.25 / (order or _ORDERS[-1]))
+    flow = linear_flow(cycle, 0.25 / order)
     size_after = np.roll(flow.size, -1, axis=0)
     sizes = flow.size[:, None] / size_after[:, :, None]
     jumps = (flow.jumps.by_state - np.eye(s.d)) * sizes
-    if np.abs(jumps).max() > 1e-9 or flow.jumps.by_input.any():
+    if np.abs(jumps).max() > _NO_JUMP or flow.jumps.by_input.any():
         raise DefinitionError(
-            f"{type(s.system).__name__} has events at which deviations jump, which no finite "
+            f"{name_of(s.system)} has events at which deviations jump, which no finite "
             "number of harmonics represents: use `cycle.htf` (exact)."
         )
     _, by_state, by_input = linear_outputs(s, flow, z)
-    series = [
-        flow.by_state,
-        flow.by_input[..., columns],
-        by_state,
-        by_input[..., columns],
-    ]
-    angles = 2 * np.pi * flow.after(map) / period
-    weights = flow.length[:, None] * rule().weights / period
-    orders = _ORDERS if order is None else (order,)
-    for n in orders:
-        m = np.arange(-n, n + 1)
-        A, B, C, D = (_toeplitz(x, n, angles, weights) for x in series)
-        rotation = np.repeat(2j * np.pi * m / period, s.d)
-        A = A - np.diag(rotation)
-        space = HarmonicStateSpace(
-            A=A,
-            B=B,
-            C=C,
-            D=D,
-            order=n,
-            error=np.nan,
-        )
-        response = space.transfer(_TRIED, period)
-        truncated = response[:, n - 1 : n + 2]
-        largest = np.abs(exact).max()
-        error = np.abs(truncated - exact).max() / largest
-        space = space._replace(error=float(error))
-        if order or space.error < tolerance:
-            return space
-    raise ComputationError(f"order {n} has the error {space.error:.1e}: set `order`.")
+    return _Linearized(
+        period=map.expected,
+        angles=2 * np.pi * flow.after(map) / map.expected,
+        weights=flow.length[:, None] * rule().weights / map.expected,
+        A=flow.by_state,
+        B=flow.by_input[..., columns],
+        C=by_state,
+        D=by_input[..., columns],
+    )
+
+
+def _truncated(linear: _Linearized, order: int) -> HarmonicStateSpace:
+    """The harmonic state space of an order, whose error is not known yet."""
+
+    def blocks(x):
+        return _toeplitz(x, order, linear.angles, linear.weights)
+
+    m = np.arange(-order, order + 1)
+    rotation = np.repeat(2j * np.pi * m / linear.period, linear.A.shape[-1])
+    return HarmonicStateSpace(
+        A=blocks(linear.A) - np.diag(rotation),
+        B=blocks(linear.B),
+        C=blocks(linear.C),
+        D=blocks(linear.D),
+        order=order,
+        error=np.nan,
+    )
+
+
+def _error_of(
+    space: HarmonicStateSpace, exact: Complex[np.ndarray, "F 3 ny nu"], period: float
+) -> float:
+    """The largest error of H_-1, H_0 and H_1, relative to the largest of them."""
+    response = space.transfer(_TRIED, period)
+    of_three = response[:, space.order - 1 : space.order + 2]
+    return float(np.abs(of_three - exact).max() / np.abs(exact).max())
 
 
 def _toeplitz(

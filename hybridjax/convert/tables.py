@@ -1,4 +1,9 @@
-"""Results as `pandas.DataFrame`."""
+"""Results as `pandas.DataFrame`: `result.to_pandas()` (`_core/showable.py`) calls `to_pandas`.
+
+Each type of result has a function that is registered with `_columns` and returns the columns by
+their names, or a finished table. Results with named axes go through `to_xarray`. A new type of
+result is one more function here; a result without one shows its findings.
+"""
 
 import functools
 from typing import Any

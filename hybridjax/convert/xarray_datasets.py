@@ -1,7 +1,14 @@
 """Results as `xarray.Dataset`, and back where `hj.save` writes them.
 
-Axes of arrays have names in the annotations of fields; these become dimensions. Names of signals
-and numbers of harmonics become their coordinates. All other fields are JSON in an attribute.
+| of an object | becomes in the dataset | by |
+|---|---|---|
+| arrays | variables; the names of axes in annotations become dimensions | `_axes`, `_AXES` |
+| names of signals, numbers of harmonics | coordinates | `_COORDINATES` |
+| all other fields | JSON in the attribute `hybridjax` | `_from_module` |
+
+`from_xarray` goes the same way back (`_coordinates`, `_arrays`). `Recording`, `SectionData`,
+`LimitCycles` and `Branch` only become datasets, each by a function of its own. If an array has
+wrong dimensions, look at `_axes`.
 """
 
 import json
@@ -131,29 +138,9 @@ def from_xarray(dataset: Any) -> Saved:
         ) from None
     static = restored(header["static"], header["units"])
     try:
-        for dimension, size in header["sizes"].items():
-            order = dataset[dimension].values
-            whole = dimension == "section"
-            late = order[0] % (size if whole else static["n_sections"])
-            has_gaps = (np.diff(order) != 1).any()
-            if late or has_gaps or (whole and len(order) < size):
-                raise DefinitionError(
-                    f"`{dimension}` must be in order, from section 0 on."
-                )
-        for dimension, field in _COORDINATES.items():
-            if dimension in dataset.coords:
-                static[field] = tuple(x.item() for x in dataset[dimension].values)
-            if f"{dimension}_unit" in dataset.coords:
-                units = dataset[f"{dimension}_unit"].values
-                static[field] = tuple(map(Signal, static[field], map(str, units)))
-        arrays = {}
-        if "frequency" in dataset.coords:
-            arrays["frequencies"] = np.asarray(dataset["frequency"].values)
-        for name in map(str, dataset.data_vars):
-            array = dataset[name]
-            array = array.transpose(*_axes(kind, name, array.ndim))
-            arrays[name] = np.asarray(array.values)
-        return put_together(kind, static, arrays)
+        _require_order(dataset, header["sizes"], static)
+        static |= _coordinates(dataset)
+        return put_together(kind, static, _arrays(kind, dataset))
     except (
         HybridJaxError,
         LookupError,
@@ -166,7 +153,47 @@ def from_xarray(dataset: Any) -> Saved:
         ) from error
 
 
+def _coordinates(dataset: Any) -> dict[str, tuple]:
+    """The fields that are coordinates of a dataset: names of signals, and harmonics."""
+    fields = {}
+    for dimension, field in _COORDINATES.items():
+        if dimension not in dataset.coords:
+            continue
+        fields[field] = tuple(x.item() for x in dataset[dimension].values)
+        if f"{dimension}_unit" in dataset.coords:
+            units = dataset[f"{dimension}_unit"].values
+            fields[field] = tuple(map(Signal, fields[field], map(str, units)))
+    return fields
+
+
+def _require_order(dataset: Any, sizes: dict[str, int], static: dict[str, Any]) -> None:
+    """**Raises:** `DefinitionError` for a part that does not begin at section 0, or has gaps; of
+    sections, all must be there."""
+    for dimension, size in sizes.items():
+        order = dataset[dimension].values
+        needs_all = dimension == "section"
+        n_sections = size if needs_all else static["n_sections"]
+        begins_late = order[0] % n_sections != 0
+        has_gaps = (np.diff(order) != 1).any()
+        lacks_some = needs_all and len(order) < size
+        if begins_late or has_gaps or lacks_some:
+            raise DefinitionError(f"`{dimension}` must be in order, from section 0 on.")
+
+
+def _arrays(kind: type, dataset: Any) -> dict[str, np.ndarray]:
+    """The arrays of an object of this type, by the names of its fields."""
+    arrays = {}
+    if "frequency" in dataset.coords:
+        arrays["frequencies"] = np.asarray(dataset["frequency"].values)
+    for name in map(str, dataset.data_vars):
+        array = dataset[name]
+        array = array.transpose(*_axes(kind, name, array.ndim))
+        arrays[name] = np.asarray(array.values)
+    return arrays
+
+
 def _from_module(module: eqx.Module) -> Any:
+    """The dataset of an object that `hj.save` can write."""
     static, arrays = taken_apart(module)
     coordinates: dict[str, Any] = {}
     for dimension, field in _COORDINATES.items():

@@ -210,6 +210,33 @@ class SequentialDesign(Showable, eqx.Module):
         `standard_error` (tested if there are cycles before the window). `DefinitionError` in the
         cases of `estimate_htf`, `fit_multipliers` and `optimal_design`.
         """
+        blocks = self._with_block(data, repeats)
+        best = estimate(blocks, self.order, self.goal)
+        self._require_supported(best, blocks)
+        errors = _standard_errors(best.fit, self.goal)
+        if best.objection:
+            errors = np.full_like(errors, np.nan)
+            plan = None
+        else:
+            multipliers = best.fit.multipliers
+            noise = best.noise[-1]
+            refuse_transient(data, repeats, multipliers, noise, self.standard_error)
+            plan = self._next(best, errors, blocks)
+        history = History(
+            blocks=blocks,
+            standard_errors=_with_row(self.standard_errors, errors),
+            estimate=best,
+            plan=plan,
+        )
+        return eqx.tree_at(
+            lambda s: s._history, self, history, is_leaf=lambda x: x is None
+        )
+
+    def _with_block(self, data: ExperimentData, repeats: int) -> tuple[Block, ...]:
+        """Return the blocks with one more.
+
+        **Raises:** `DefinitionError` for data of other inputs, outputs or sections.
+        """
         require_equal(
             "data and study", "n_sections", data.n_sections, self.first.n_sections
         )
@@ -219,8 +246,11 @@ class SequentialDesign(Showable, eqx.Module):
             require_same(
                 "blocks of one study", earlier.htf, block.htf, ("inputs", "outputs")
             )
-        blocks = (*self._history.blocks, block)
-        best = estimate(blocks, self.order, self.goal)
+        return *self._history.blocks, block
+
+    def _require_supported(self, best: Estimate, blocks: tuple[Block, ...]) -> None:
+        """**Raises:** `DefinitionError` if the data show more multipliers than `order`, or support
+        fewer, which are as precise as requested already."""
         if are_alike(best.fit.correlation, best.fit.dof):
             raise DefinitionError(
                 f"the data show more than {self.order} multipliers: add the blocks to a study with "
@@ -228,34 +258,6 @@ class SequentialDesign(Showable, eqx.Module):
             )
         if 0 < best.supported < self.order:
             self._refuse_surplus(blocks, best.supported)
-        errors = _standard_errors(best.fit, self.goal)
-        if best.objection:
-            errors = np.full_like(errors, np.nan)
-        else:
-            noise = best.noise[-1]
-            refuse_transient(
-                data, repeats, best.fit.multipliers, noise, self.standard_error
-            )
-        errors_so_far = [*self.standard_errors, errors]
-        width = max(map(len, errors_so_far))
-        padded = []
-        for row in errors_so_far:
-            padding = np.full(width - len(row), np.nan)
-            padded.append(np.append(row, padding))
-        cycles = sum(block.cycles for block in blocks)
-        if best.objection:
-            plan = None
-        else:
-            plan = self._next(best, errors, cycles, len(blocks))
-        history = History(
-            blocks=blocks,
-            standard_errors=np.array(padded),
-            estimate=best,
-            plan=plan,
-        )
-        return eqx.tree_at(
-            lambda s: s._history, self, history, is_leaf=lambda x: x is None
-        )
 
     def _suffices(self, fit: StructuredFit, errors: Float[np.ndarray, " g"]) -> bool:
         """Return whether these standard errors are as small as requested."""
@@ -280,8 +282,7 @@ class SequentialDesign(Showable, eqx.Module):
         self,
         best: Estimate,
         errors: Float[np.ndarray, " g"],
-        cycles: float,
-        blocks: int,
+        blocks: tuple[Block, ...],
     ) -> OptimalDesign:
         """Return the design for the missing cycles."""
 
@@ -292,7 +293,7 @@ class SequentialDesign(Showable, eqx.Module):
                 goal=self.goal,
                 limit=limit,
                 noise=best.last_noise,
-                seed=self.seed + blocks,
+                seed=self.seed + len(blocks),
             )
 
         plan = planned(self.limit)
@@ -302,7 +303,7 @@ class SequentialDesign(Showable, eqx.Module):
         wanted = now * (self.standard_error / errors.max() / _student(best.fit)) ** 2
         squares = (plan.standard_errors**2).sum()
         missing = plan.cycles * squares * (1 / wanted - 1 / now)
-        at_most = _GROWTH * cycles
+        at_most = _GROWTH * sum(block.cycles for block in blocks)
         cycles_more = min(missing * (1 + _SPARE), at_most)
         count = int(np.ceil(cycles_more / periods))
         count = min(
@@ -374,6 +375,19 @@ class SequentialDesign(Showable, eqx.Module):
         experiments = how_many(design.experiments, "experiment", "experiments")
         periods = how_many(design.periods, "period", "periods")
         return f"{comparison}\nnext: {experiments} of {periods}"
+
+
+def _with_row(
+    rows: Float[np.ndarray, "B g"], row: Float[np.ndarray, " h"]
+) -> Float[np.ndarray, "B1 w"]:
+    """Return a table with one more row. Rows that are shorter than others end with NaN. (Estimates
+    may have pairs in place of real multipliers, so that their numbers of errors differ.)"""
+    width = max(rows.shape[1], len(row))
+
+    def padded(x):
+        return np.append(x, np.full(width - len(x), np.nan))
+
+    return np.array([padded(x) for x in (*rows, row)])
 
 
 def _standard_errors(

@@ -5,6 +5,7 @@ step, and gets the first crossing as a fraction of the step. The interpolant is 
 into at most three monotone pieces, so that the first crossing is also found where the guard dips
 below zero and returns within the step. `search/attempt.py` calls `bounds` to see that a guard stays
 away from zero. An event that the search misses or invents has its cause in these two functions.
+`dips` is the test of a trajectory that follows an itinerary.
 """
 
 from typing import NamedTuple
@@ -160,6 +161,17 @@ def root_near_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     for _ in range(4):
         s = s - _divide(cubic.value(s), cubic.slope(s))
     return s
+
+
+def dips(v0, v1, d0, d1) -> Flags:
+    """Test whether the cubic with values v0, v1 and slopes d0, d1 (per step) is positive at both
+    ends and negative between."""
+    xp = namespace(v1)
+    cubic = _Cubic.of(v0, v1, d0, d1)
+    is_negative = xp.zeros_like(v1, bool)
+    for node in cubic.extrema():
+        is_negative = is_negative | ((node < 1) & (cubic.value(node) < 0))
+    return (v0 > 0) & (v1 > 0) & is_negative
 
 
 def interpolate(x, h, q0, q1, f0, f1):

@@ -186,10 +186,10 @@ class Entry(NamedTuple):
     """Guards of the charts that lanes enter, compared with the guards of the charts that they
     leave."""
 
-    known: Bool[Array, "G L"]
+    known: Bool[Array, "G *L"]
     """Whether the chart before has the same guard: it is the same chart, or its guard has the same
     value."""
-    armed: Bool[Array, "G L"]
+    armed: Bool[Array, "G *L"]
     """Whether the guard was armed in the chart before."""
 
 

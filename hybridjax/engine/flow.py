@@ -1,9 +1,9 @@
 """Flow of many lanes (trajectories side by side) to their targets, with the events on the way and
 states at given times, differentiable.
 
-`pass_through` is the function that `orbits/flow.py` calls, inside of its compiled programs. As in
-`move.py`, values are those of a search, and derivatives are those of a replay of the tape (the
-record of the search's steps); `_passed_jvp` joins the two. Here, `_events` and `_samples` also read
+`pass_through` is the function that `orbits/flow_program.py` compiles. As in `move.py`, values are
+those of a search, and derivatives are those of a replay of the tape (the record of the search's
+steps); `_passed_jvp` joins the two. Here, `_events` and `_samples` also read
 events and states at given times from the tape. If an event or a sample is wrong and the end of the
 flow is right, look in these two.
 """

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.compilation import kernel
 from .._core.executor import from_host, is_traced, on_host
-from .._core.lanes import PerLane, by_lane
+from .._core.lanes import PerLane, by_lane, shared
 from ..systems.solver import Method
 from ..systems.structure import Kind, Member, Structure, stacked
 from ..systems.system import Output
@@ -203,6 +203,16 @@ def levels(
 
 def _field(a: int, s: Structure, t, q, u, *_):
     return s.field(a, t, q, u)
+
+
+def has_level(s: Structure, a: int, levels: AbstractLevels | PerLane | None) -> bool:
+    """Test whether a level of the section is watched in chart a."""
+    return levels is not None and shared(levels).present(s, a)
+
+
+def count_watched(s: Structure, a: int, levels: AbstractLevels | PerLane | None) -> int:
+    """The number of the functions of `watched_at`."""
+    return len(s.guards(a)) + has_level(s, a, levels)
 
 
 def watched_at(

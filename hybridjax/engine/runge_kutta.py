@@ -245,10 +245,11 @@ def _implicit_step(
     stages. They change the stages by rounding errors only, but give them their first and second
     derivatives (implicit function theorem).
     """
-    start = [jax.lax.stop_gradient(x) for x in (t, q, h)]
+    start = jax.lax.stop_gradient((t, q, h))
     w, left, J = increments(method, still or field, *start)
     if still is not None:
-        w = _with_derivatives(method, field, still, (t, q, h), w)
+        equations = StageEquations.at(method, still, *start, w)
+        w, _ = with_derivatives(method, field, (t, q, h), equations, w)
     estimate, local = errors(method, w, left, J, start[2])
     change = _contract(method.b, w)
     end = q + change
@@ -367,19 +368,25 @@ def increments(method, field, t, q, h, small: float = _SETTLED):
     return w, last, J
 
 
-def _with_derivatives(method, field, still, start, w):
-    """The increments w, as functions of the field and of the `start` (t, q, h) of the step."""
+def with_derivatives(
+    method: Method,
+    field: LaneField,
+    start: tuple[AnyTimes, States, AnyTimes],
+    equations: "StageEquations",
+    w: Float[Array, "s n L"],
+) -> tuple[Float[Array, "s n L"], Float[Array, "s n L"]]:
+    """The increments w after two Newton steps, as functions of the field and of the `start`
+    (t, q, h) of the step, and their last change. The second step gives them their derivatives
+    (implicit function theorem)."""
     t, q, h = start
-    A = np.array(method.a)
     c = np.array(method.c)[:, None]
-    times = t + c * h
-    fixed = [jax.lax.stop_gradient(x) for x in start]
-    equations = StageEquations.at(method, still, *fixed, w)
+    change = w
     for _ in range(2):
-        stages = q + _contract(A, w)
-        residual = h * jax.vmap(field)(times, stages) - w
-        w = w + equations.solve(residual)
-    return w
+        stages = q + _contract(method.a, w)
+        residual = h * jax.vmap(field)(t + c * h, stages) - w
+        change = equations.solve(residual)
+        w = w + change
+    return w, change
 
 
 class StageEquations(NamedTuple):

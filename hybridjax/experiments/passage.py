@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from .._core.compilation import Program
 from ..engine import kernels
 from ..engine.arrays import Array
-from ..engine.itinerary.flags import Watched, dips
+from ..engine.cubic import dips
 from ..engine.runge_kutta import looped_step
 from ..engine.settings import Settings, size
 from ..systems.solver import Method
@@ -367,11 +367,11 @@ class _Moves:
         return lambda t, q: field(t, q, u)
 
     def _has_level(self, a: int) -> bool:
-        return self.levels is not None and self.levels.present(self.s, a)
+        return kernels.has_level(self.s, a, self.levels)
 
     def _functions(self, a: int) -> int:
         """Number of watched functions."""
-        return len(self.s.guards(a)) + self._has_level(a)
+        return kernels.count_watched(self.s, a, self.levels)
 
     def _unknown(self, lanes: int):
         """Placeholders for watched functions and their rates, before any is evaluated."""
@@ -405,9 +405,9 @@ class _Moves:
         is_known = signs != 0
         same = jnp.sign(value) * signs > 0
         other = (is_known & ~same)[:count]
-        before = Watched(jnp.zeros_like(x.h), x.value, x.rate)
-        now = Watched(x.h, value, rate)
-        returns = dips(before, now, signs) & is_known
+        values = signs * x.value, signs * value
+        slopes = signs * x.h * x.rate, signs * x.h * rate
+        returns = dips(*values, *slopes) & is_known
         return other.any(axis=0) | returns[:guards].any(axis=0)
 
 

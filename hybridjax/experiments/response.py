@@ -44,7 +44,7 @@ from ..sections.placed import (
     section_target,
 )
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem, Output, OutputNames, arrays_of
+from ..systems.system import HybridSystem, Output, OutputNames, arrays_of, name_of
 from .plan import ROUNDING, Accuracy, Plan, Stepping, plan_flow
 
 
@@ -240,7 +240,7 @@ class ResponseFunction(eqx.Module):
         s = self.placed.structure()
         names = s.resolve_outputs(self.outputs).names
         return folded(
-            f"ResponseFunction({type(s.system).__name__}: {listed(s.inputs)} -> {listed(names)}; "
+            f"ResponseFunction({name_of(s.system)}: {listed(s.inputs)} -> {listed(names)}; "
             f"{self.placed.n_sections} sections; accuracy {self.stepping.accuracy:g})"
         )
 

@@ -21,6 +21,8 @@ from jaxtyping import Bool, Float, Int
 
 from .._core.executor import to_host
 from ..engine import kernels
+from ..engine.itinerary.legs import known_signs
+from ..engine.itinerary.recorded import CORRECTIONS
 from ..engine.lanes import IDLE
 from ..sections.placed import PlacedSections
 from ..systems.structure import Kind, Member, Structure
@@ -28,16 +30,9 @@ from ..systems.transition import Scheduled
 from .plan import Plan
 
 
-# Number of Newton corrections of the time of an event, by the method of the chart. One correction
-# by an Euler step follows. Fewer: experiments far from the cycle miss their event. More: events
-# take longer.
-_CORRECTIONS = 2
 # Numbers of rows are rounded up to multiples of this. More: arrays are longer than needed. Fewer:
 # tables of other lengths are compiled again.
 _ROUND = 16
-# A guard that is smaller than this part of its largest value in the chart may have either sign.
-# Larger: a crossing is not noticed. Smaller: rounding errors at events count as a crossing.
-_NEAR_ZERO = 1e-7
 # The time to an event is Newton's guess times a factor, which is known from the cycle, if the
 # factor lies between this and its inverse. Larger: bad guesses set the length of steps. Smaller:
 # good guesses are not used.
@@ -330,7 +325,7 @@ class _Writer:
         arrives = event.at_section and is_own
         self._leg(k, a, duration, newton, passed=e, target=target, signs=signs)
         nothing = np.zeros(self.width, int)
-        for _ in range(_CORRECTIONS):
+        for _ in range(CORRECTIONS):
             self._add(
                 Body(a),
                 k,
@@ -342,7 +337,7 @@ class _Writer:
             )
         at_event = self.before.signs[e % len(self.events)].copy()
         at_event[target] = 0
-        if self._has_level(a):
+        if kernels.has_level(self.s, a, self.levels):
             at_event[-1] = 0
         waits = len(self._intervals(e)) > 1
         self._add(
@@ -483,13 +478,11 @@ class _Writer:
         a = self.s.chart_index(self.s.transitions[g].source)
         return a, member.kind, int(member.place[0])
 
-    def _has_level(self, a: int) -> bool:
-        return self.levels is not None and self.levels.present(self.s, a)
-
     def _points(self, section, t, chart, q) -> _Points:
         """Watched functions at points after these sections."""
         s = self.s
-        counts = [len(s.guards(a)) + self._has_level(a) for a in range(len(s.dims))]
+        charts = range(len(s.dims))
+        counts = [kernels.count_watched(s, a, self.levels) for a in charts]
         newton = np.zeros((len(t), max(counts)))
         signs = np.zeros((len(t), max(counts)), int)
         for a in np.unique(chart).tolist():
@@ -508,9 +501,7 @@ class _Writer:
             rate = columns[:, 1] + np.sum(gradient * field, axis=1)
             with np.errstate(all="ignore"):
                 newton[here, :count] = np.nan_to_num(-value / rate).T
-            largest = np.abs(value).max(axis=1, keepdims=True)
-            known = np.abs(value) > _NEAR_ZERO * largest
-            signs[here, :count] = np.where(known, np.sign(value), 0).T
+            signs[here, :count] = known_signs(value).T
         return _Points(newton, signs)
 
 

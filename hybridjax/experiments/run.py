@@ -42,7 +42,7 @@ from ..sections.linearization import linearize
 from ..sections.place import as_placed
 from ..sections.placed import PlacedSections, SectionsLike
 from ..systems.structure import Outputs
-from ..systems.system import Output, OutputNames
+from ..systems.system import Output, OutputNames, name_of
 from .data import ExperimentData, Simulated
 from .design.design import DISCARD, Design, require_inputs
 from .noise import ProcessNoise
@@ -462,7 +462,7 @@ def _require_return(
     """**Raises:** an error for cycles that experiments would leave."""
     if not cycle.clocked and bool(np.isfinite(placed.bound.time).any()):
         raise DefinitionError(
-            f"{type(cycle.system).__name__} has no clock: at clock sections nothing brings its "
+            f"{name_of(cycle.system)} has no clock: at clock sections nothing brings its "
             "phase back (a multiplier of exactly 1). Use sections that depend on the state "
             "(KinematicPhase, or a list of Crossing and AtEvent)."
         )

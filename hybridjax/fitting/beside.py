@@ -185,7 +185,9 @@ def _beside(problem: FitProblem, known: LimitCycle) -> Beside | None:
 
 
 def _families(observations: Any) -> list[AbstractSections]:
-    is_family = lambda x: isinstance(x, AbstractSections)  # noqa: E731
+    def is_family(x):
+        return isinstance(x, AbstractSections)
+
     leaves = jax.tree_util.tree_leaves(observations, is_leaf=is_family)
     return [x for x in leaves if is_family(x)]
 

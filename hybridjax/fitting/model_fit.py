@@ -30,7 +30,7 @@ from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
 from ..sections.families import AbstractSections
 from ..sections.linearization import linearize
-from ..systems.system import HybridSystem, arrays_of, unit_of_parameter
+from ..systems.system import HybridSystem, arrays_of, name_of, unit_of_parameter
 from .problem import DELAYS, FALSE_ALARMS, FitProblem, of_system, tail_of
 
 
@@ -86,7 +86,8 @@ class Identifiability(Showable, eqx.Module):
     def __repr__(self) -> str:
         nonzero = ", ".join(f"{x:.2g}" for x in self.singular_values[: self.rank])
         lost = ", ".join(f"{x:.1g}" for x in self.singular_values[self.rank :])
-        names, p = ", ".join(self.names), len(self.names)
+        names = ", ".join(self.names)
+        p = len(self.names)
         lines = [
             f"Identifiability: {self.rank} of {p} combinations of ({names}) are identified"
         ]
@@ -134,17 +135,25 @@ def _rounded(rows: Float[np.ndarray, "k p"]) -> Float[np.ndarray, "k p"]:
 
 
 def _describe(names: tuple[str, ...], row: Float[np.ndarray, " p"]) -> str:
-    parts = [(name, w) for name, w in zip(names, row, strict=True) if w]
-    if len(parts) == 1:
-        return parts[0][0]
-    together = ", ".join(name for name, _ in parts)
-    if all(w == parts[0][1] for _, w in parts):
-        only = f", only {parts[0][0]}/{parts[1][0]}" if len(parts) == 2 else ""
-        return f"a common factor of ({together}){only}"
-    if len(parts) == 2 and parts[0][1] == -parts[1][1]:
-        return f"{parts[0][0]} and {parts[1][0]} apart, only their product"
-    powers = ", ".join(name if w == 1 else f"{name}^{w:.3g}" for name, w in parts)
-    return f"a common factor, with these powers, of ({powers})"
+    """An unidentifiable combination in words, from its relative change of each parameter."""
+    places = np.flatnonzero(row)
+    moved = [names[k] for k in places]
+    power = row[places]
+    first = moved[0]
+    if len(moved) == 1:
+        return first
+    last = moved[-1]
+    together = ", ".join(moved)
+    if np.all(power == power[0]):
+        if len(moved) == 2:
+            return f"a common factor of ({together}), only {first}/{last}"
+        return f"a common factor of ({together})"
+    if len(moved) == 2 and power[0] == -power[1]:
+        return f"{first} and {last} apart, only their product"
+    powers = []
+    for name, x in zip(moved, power, strict=True):
+        powers.append(name if x == 1 else f"{name}^{x:.3g}")
+    return f"a common factor, with these powers, of ({', '.join(powers)})"
 
 
 @leading_on
@@ -257,11 +266,13 @@ class ParameterFit(WithCost, Fit):
             )
         else:
             given = true
-        if more := [name for name in given if name not in self.names]:
+        more = [name for name in given if name not in self.names]
+        if more:
             raise DefinitionError(
                 f"the other values have another '{more[0]}', which was not fitted: free it."
             )
-        if missing := [name for name in self.names if name not in given]:
+        missing = [name for name in self.names if name not in given]
+        if missing:
             raise DefinitionError(
                 f"the other values lack '{missing[0]}', which was fitted."
             )
@@ -478,7 +489,7 @@ class ModelFit(ParameterFit):
         return ParameterEstimate(
             names=self.names,
             units=self.units,
-            system=type(self.system).__name__,
+            system=name_of(self.system),
             values=np.asarray(self.values),
             covariance=np.asarray(self.covariance),
             unseen=np.asarray(self.unseen),
@@ -552,7 +563,7 @@ class ModelFit(ParameterFit):
 
     def _summary(self) -> str:
         lines = [
-            f"ModelFit({type(self.system).__name__}: {Result(self.result).message})",
+            f"ModelFit({name_of(self.system)}: {Result(self.result).message})",
             self._cost(),
             "standard errors include noise, but no distortion:",
             *self._table(),
@@ -607,5 +618,5 @@ class ModelFit(ParameterFit):
         parameters = table(
             ("parameter", "value", "standard error", "unit"), self.rows()
         )
-        of = f"of {type(self.system).__name__}: {Result(self.result).message}"
+        of = f"of {name_of(self.system)}: {Result(self.result).message}"
         return of, parameters, text(self._cost())

@@ -118,7 +118,8 @@ class Parameters(eqx.Module):
     def encode(self, values: Float[Array, "*b p"]) -> Float[Array, "*b p"]:
         """Return the coordinates of parameter values; NaN for a value outside of its bounds."""
         low, high, cases = self._bounds()
-        up, down = values - low, high - values
+        up = values - low
+        down = high - values
         logarithms = [jnp.log(up / down), jnp.log(up), jnp.log(down)]
         return jnp.select(cases, logarithms, values / self.size)
 
@@ -134,11 +135,11 @@ class Parameters(eqx.Module):
     def _bounds(self) -> tuple[Array, Array, list[Array]]:
         """Return the bounds with zero in place of infinity; and masks of parameters with both
         bounds, a lower bound, and an upper bound."""
-        low, high = jnp.isfinite(self.low), jnp.isfinite(self.high)
-        lowest = jnp.where(low, self.low, 0.0)
-        highest = jnp.where(high, self.high, 0.0)
-        finite = lowest, highest
-        return *finite, [low & high, low, high]
+        has_low = jnp.isfinite(self.low)
+        has_high = jnp.isfinite(self.high)
+        low = jnp.where(has_low, self.low, 0.0)
+        high = jnp.where(has_high, self.high, 0.0)
+        return low, high, [has_low & has_high, has_low, has_high]
 
 
 def of_system(name: str) -> bool:
@@ -213,13 +214,16 @@ def candidate_cycle(
     `factors` and `pieces` are NaN: derivatives of a cycle's factors are second derivatives of the
     flow, and take two thirds of the time of compilation.
     """
-    map, last = guess.return_map.at_phase_of(system), None
+    map = guess.return_map.at_phase_of(system)
+    last = None
     if is_inside_program():
         q, turn, steps = root(map, NEWTON_STEPS)
-        period, anchor = map.turn(q, turn.record).period, map.departure(q)
+        period = map.turn(q, turn.record).period
+        anchor = map.departure(q)
     else:
         anchor, turn, steps, _ = solve(map, True, False, last_turn(guess))
-        period, last = turn.period, turn
+        period = turn.period
+        last = turn
     period = map.expected if map.base is None else period
     code = jnp.where(turn.closed, Result.OK, Result.NOT_CONVERGED)
     cycle = dataclasses.replace(
@@ -354,8 +358,13 @@ def _joined(parts, result):
 def _with_jacobian(problem: FitProblem, x, guess):
     """Return residuals (r,), their Jacobian (r, p) with all columns in one pass, in forward mode,
     and the anchor, the period and the last turn."""
-    at = lambda x: problem.residuals(x, guess)  # noqa: E731
-    push = lambda t: jax.jvp(at, (x,), (t,), has_aux=True)  # noqa: E731
+
+    def at(x):
+        return problem.residuals(x, guess)
+
+    def push(direction):
+        return jax.jvp(at, (x,), (direction,), has_aux=True)
+
     along = jax.vmap(push, out_axes=(None, -1, None))
     return along(np.eye(x.shape[0]))
 
@@ -371,7 +380,8 @@ def evaluate(
     there; and a guess for parameters near x."""
     arguments = problem, jnp.asarray(x), guess
     with on_the_cpu():
-        key, values = kind(arguments), None
+        key = kind(arguments)
+        values = None
         if key not in _not_on_host:
             try:
                 with only_on_host():
@@ -402,7 +412,8 @@ def descend(
     takes 27 evaluations instead of 8, and moves the two to 1e17 and 1e-17.) The iteration runs on
     the host, so that only the model is compiled.
     """
-    damping, steps = _DAMPING, 1
+    damping = _DAMPING
+    steps = 1
     r, J, near = evaluate(problem, x, guess)
 
     def step(damping):
@@ -414,7 +425,8 @@ def descend(
         return np.linalg.lstsq(damped, goal, rcond=_RCOND)[0]
 
     while steps < MAX_STEPS and np.isfinite(r).all() and np.isfinite(J).all():
-        trial, steps = x - step(damping), steps + 1
+        trial = x - step(damping)
+        steps += 1
         change = trial - x
         r_new, J_new, nearer = evaluate(problem, trial, near)
         predicted = (J @ change) @ (J @ change + 2 * r)

@@ -32,7 +32,7 @@ from ..orbits.find import find_limit_cycle
 from ..sections.linearization import linearize
 from ..sections.place import as_placed
 from ..sections.placed import SectionsLike
-from ..systems.system import HybridSystem, OutputNames
+from ..systems.system import HybridSystem, OutputNames, name_of
 from .htf_estimate import estimate_htf
 from .multiplier_estimate import MultiplierComparison, OfFit
 from .multipliers import StructuredFit, fit_multipliers
@@ -79,7 +79,7 @@ class ModelIdentification(OfFit, eqx.Module):
         return (*self.cycle.findings, *self.fit.findings)
 
     def __repr__(self) -> str:
-        name = type(self.cycle.system).__name__
+        name = name_of(self.cycle.system)
         return f"ModelIdentification({name}; {self.data.summary()})\n{self.fit}\n{self.comparison}"
 
 

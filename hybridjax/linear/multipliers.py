@@ -63,10 +63,15 @@ def product_eigenvalues(
     return eigenvalues[largest_first(eigenvalues)]
 
 
-def largest_first(values: Complex[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def largest_first(values: Complex[np.ndarray, "*B n"]) -> Int[np.ndarray, "*B n"]:
     """The indices that sort complex numbers by decreasing modulus; of a conjugate pair, the number
     with positive imaginary part comes first."""
     return np.lexsort((-np.imag(values), -np.abs(values)))
+
+
+def conjugate_of(values: Complex[np.ndarray, " n"], k: int) -> int:
+    """The index of the complex conjugate of number k, which is k for a real number."""
+    return int(np.argmin(np.abs(values - values[k].conj())))
 
 
 def _balanced(factors):

@@ -30,7 +30,7 @@ from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import number
 from ..errors import DefinitionError
-from ..systems.system import Guess, copies_of, parameters_of, require_positive
+from ..systems.system import Guess, copies_of, name_of, parameters_of, require_positive
 from .batches import front
 from .branch_ends import explained
 from .coincidence import SAME
@@ -164,7 +164,7 @@ class Branch(Showable, eqx.Module):
         return "\n  ".join(lines)
 
     def __repr__(self):
-        name = type(self.cycles.systems).__name__
+        name = name_of(self.cycles.systems)
         return f"Branch({name} along {self.parameter}: {len(self)} cycles)\n  {self.summary()}"
 
     def _repr_html_(self) -> str:
@@ -183,7 +183,7 @@ class Branch(Showable, eqx.Module):
             Line(self.values[marks], largest[marks], color=COLORS[1], points=True),
         ]
         drawn = picture(curves, self.parameter, "largest modulus of multipliers")
-        kind = type(self.cycles.systems).__name__
+        kind = name_of(self.cycles.systems)
         title = f"of {kind}: {len(self)} cycles"
         return card("Branch", title, table(("", self.parameter, ""), rows), drawn)
 
@@ -249,7 +249,7 @@ def continuation(
     first = curve.first()
     if isinstance(first, Result):
         raise DefinitionError(
-            f"the cycle given is none of {type(cycle.system).__name__} at {parameter} = "
+            f"the cycle given is none of {name_of(cycle.system)} at {parameter} = "
             f"{curve.value:.6g}: {first.message}. Find it anew."
         )
     trace = _Trace(
@@ -276,19 +276,20 @@ def _parameter_and_range(
     **Raises:** `DefinitionError` where one of them is missing, or there are several.
     """
     given = list(taken_parameters(continuation, cycle, by_name).items())
-    if given and (parameter is None) != (range is None):
-        raise DefinitionError(
-            f"continuation: `{given[0][0]}={given[0][1]}` stands for both `parameter` and `range`: "
-            "leave these out."
-        )
     if parameter is not None and range is not None:
         given.append((parameter, range))
+    elif given and (parameter is not None or range is not None):
+        name, values = given[0]
+        raise DefinitionError(
+            f"continuation: `{name}={values}` stands for both `parameter` and `range`: leave these "
+            "out."
+        )
     if len(given) > 1:
         names = " and ".join(f"`{name}`" for name, _ in given)
         raise DefinitionError(
             f"a continuation has one parameter, not {names}: `hj.sweep` takes several."
         )
-    if not given or (parameter is not None and range is None):
+    if not given:
         names = parameters_of(cycle.system)
         name = parameter or next((x for x in names if "." not in x), "k")
         raise DefinitionError(

@@ -30,7 +30,7 @@ from ..linear.time_response import monodromy
 from ..systems.check import check_output, check_schedules, check_system
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Outputs, Structure
-from ..systems.system import HybridSystem, Output, OutputNames
+from ..systems.system import HybridSystem, Output, OutputNames, name_of
 from ..systems.transition import SAME_TIME, Scheduled
 from .coincidence import SAME, about_begin
 from .cycle import LimitCycle, orbit
@@ -132,7 +132,7 @@ def default_outputs(s: Structure) -> tuple[str, ...]:
     names = tuple(s.states_everywhere())
     if not names:
         raise DefinitionError(
-            f"no state is in all charts of {type(s.system).__name__}, to be recorded by default: "
+            f"no state is in all charts of {name_of(s.system)}, to be recorded by default: "
             "give `outputs`, names of states or `hj.Output`s that exist at the sections."
         )
     return names
@@ -192,7 +192,7 @@ def _compare(
     gains_differ = change[:, 1 + len(size) :] > SAME * largest
     if np.any(values_differ) or np.any(gains_differ):
         raise DefinitionError(
-            f"{name} does not have the period {period:.6g} that {type(s.system).__name__}.period() "
+            f"{name} does not have the period {period:.6g} that {name_of(s.system)}.period() "
             "states."
         )
 
@@ -274,7 +274,7 @@ def _output(s: Structure, a: int, output: Output) -> tuple[str, Callable]:
 
 def _no_period(system: HybridSystem, problem: str) -> str:
     return (
-        f"{problem}, but {type(system).__name__} states no period: give it a method `period()` "
+        f"{problem}, but {name_of(system)} states no period: give it a method `period()` "
         "that returns the time after which everything that depends on t repeats."
     )
 
@@ -353,7 +353,7 @@ def check_conserved(cycle: LimitCycle) -> None:
     lost = cycle.conserved.keys() - kept.keys()
     if lost:
         raise DefinitionError(
-            f"'{min(lost)}' is not conserved by {type(cycle.system).__name__}: neighbors of the "
+            f"'{min(lost)}' is not conserved by {name_of(cycle.system)}: neighbors of the "
             "cycle change it in one turn. Leave it out of `conserved`."
         )
 
@@ -379,7 +379,7 @@ def explain(cycle: LimitCycle, turn: Turn, expected: float, settle: float) -> st
     about_orbit = _about_orbit(cycle, code, turn)
     if about_orbit:
         return about_orbit
-    name = type(cycle.system).__name__
+    name = name_of(cycle.system)
     reason = code.message
     if code == Result.STEP_LIMIT:
         reached = f"(reached: {turn.period:.2g} of {expected:.3g})"
@@ -411,7 +411,7 @@ def _about_orbit(cycle: LimitCycle, code: Result, turn: Turn) -> str:
             return _about_coincidence(cycle, pair)
     if code == Result.SINGULAR:
         return _about_family(cycle)
-    name = type(cycle.system).__name__
+    name = name_of(cycle.system)
     if code in (Result.GUARD_BEYOND, Result.NOT_VERIFIED):
         faults = [finding.text for finding in verdict(cycle).refused]
         reason = " ".join(faults[:2]) or f"{code.message}."
@@ -427,7 +427,7 @@ def _about_orbit(cycle: LimitCycle, code: Result, turn: Turn) -> str:
 
 def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
     """The reason for a search that ended where two events coincide."""
-    name = type(cycle.system).__name__
+    name = name_of(cycle.system)
     first, second = (cycle.structure.transitions[g].name for g in pair)
     return (
         f"on the limit cycle of {name} the events '{first}' and '{second}' coincide: beside it "
@@ -439,7 +439,7 @@ def _about_coincidence(cycle: LimitCycle, pair: tuple[int, int]) -> str:
 
 def _about_family(cycle: LimitCycle) -> str:
     """The reason for a search that ended on a cycle of a family."""
-    name = type(cycle.system).__name__
+    name = name_of(cycle.system)
     outputs = tuple(output.name for output in cycle.system.outputs())
     conserved = _conserved_outputs(cycle, outputs)
     example = {output: float(f"{value:.4g}") for output, value in conserved.items()}

@@ -335,7 +335,8 @@ def _guards_due(
     rows = kernels.watched(s, a, None, time, q.T, u, first)
     watched = rows[:, :, 0]
     field = kernels.field(s, a, time, q.T, u)[:, 0, 0]
-    level, by_t = watched[:, 0], watched[:, 1]
+    level = watched[:, 0]
+    by_t = watched[:, 1]
     by_state = watched[:, 2 : 2 + len(field)]
     rate = by_t + by_state @ field
     return [guards[k] for k in np.flatnonzero(falls_within(level, rate, due))]

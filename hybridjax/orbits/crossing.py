@@ -68,7 +68,9 @@ class Crossing(Definition):
         value: Scalar = 0.0,
         charts: SignalNames | None = None,
     ):
-        self.signal, self.direction, self.value = signal, direction, real(value)
+        self.signal = signal
+        self.direction = direction
+        self.value = real(value)
         self.charts = None if charts is None else tuple(charts)
 
     def __str__(self):

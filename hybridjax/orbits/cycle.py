@@ -49,7 +49,7 @@ from ..linear.frequency_response import Frequencies, Harmonics
 from ..linear.htf import HTF
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
-from ..systems.system import HybridSystem, OutputNames, arrays_of
+from ..systems.system import HybridSystem, OutputNames, arrays_of, name_of
 from .coincidence import SimultaneousEvents, simultaneous_events
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
@@ -440,7 +440,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
 
     def __repr__(self):
         if is_traced(self):
-            return f"LimitCycle({type(self.system).__name__}, traced)"
+            return f"LimitCycle({name_of(self.system)}, traced)"
         if what_changed(self.system, self.numbers) or int(self.result) not in _FOUND:
             return f"LimitCycle({self._title()})"
         shown = {"multipliers": self._multipliers_text()}
@@ -475,7 +475,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
         )
 
     def _title(self) -> str:
-        name = type(self.system).__name__
+        name = name_of(self.system)
         change = what_changed(self.system, self.numbers)
         if change:
             return f"{name}: {change}"
@@ -562,7 +562,7 @@ def what_changed(
     changed = change_of(system if single is None else single)
     for key in now.keys() | numbers.keys():
         if _differ(now.get(key), numbers.get(key)):
-            changed = f"`{key}` of {type(system).__name__}"
+            changed = f"`{key}` of {name_of(system)}"
     if changed is None:
         return ""
     return (

@@ -1,10 +1,14 @@
 """The flow from any state through any events, differentiable.
 
-`requested` checks the arguments of `flow`. A single flow that JAX does not trace is computed by
-`_on_host`: it is that of `simulate`, with its checks, and has a trajectory. All others are computed
-by a program (`_flows`, `_passage`), which takes many lanes in parts and makes fewer checks. Both
-must give the same numbers: compare them first if one is wrong. Steps, events and derivatives are
-those of `engine/flow.py`.
+`flow` works in three stages:
+
+1. `requested` checks the arguments and writes them down as a `Request`.
+2. A single flow that JAX does not trace is computed by `_on_host`: it is that of `simulate`, with
+   its checks, and has a trajectory. All others are computed by the compiled program of
+   `flow_program.py`, which takes many lanes and makes fewer checks.
+3. `_result` makes the `Flow`, and `_require_ends` raises the error of one that failed.
+
+Both ways of stage 2 must give the same numbers: compare them first if one is wrong.
 """
 
 import dataclasses
@@ -15,22 +19,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from .._core.arguments import require_among
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Count, Duration, Numbers, Scalar, StepCount
 from .._core.boundary.values import Reals
-from .._core.compilation import Program, quick_jit
 from .._core.executor import Array, is_traced, namespace, to_host
 from .._core.findings import Finding, print_findings, warn_of
 from .._core.meaning import current, require_as_made
 from .._core.precision import require_x64
-from .._core.results import Result, update_result
+from .._core.results import Result
 from .._core.showable import Showable
 from .._core.text import folded, how_many, number, signal_values
-from ..engine.flow import Events, Passage, Samples, pass_through
-from ..engine.lanes import Lanes, blank_tape, lane_at, nan_where, start_lanes
+from ..engine.flow import Events, Passage, Samples
+from ..engine.lanes import Lanes, lane_at, nan_where, start_lanes
 from ..engine.search.state import Moved
 from ..engine.settings import Settings
 from ..engine.target import Target, toward, until as until_time
@@ -49,10 +52,10 @@ from ..systems.start import StateLike, SystemLike, guess_of, system_of
 from ..systems.structure import Structure
 from ..systems.system import Driven, Guess, HybridSystem, name_of
 from ..systems.transition import SAME_TIME
-from . import rivals
 from .coincidence import all_commute, groups_on
 from .crossing import AtEvent, Crossing, to_section
 from .cycle import LimitCycle
+from .flow_program import Request, is_late, passage_of, sampled_passage
 
 
 # Error of a step relative to the sizes of states. Larger: derivatives, which are those of the
@@ -65,21 +68,6 @@ MOST_STEPS = 1024
 # which is relative to this duration. Larger: users are sent to `within` where a guard is touched.
 # Smaller: they are told of a touch where there is none.
 _MUCH_SHORTER = 1e-4
-# Most flows that are computed with all steps of the record at once, by a program that compiles
-# sooner. More: they run four times as long. Fewer: some wait for the compiler in vain.
-_FEW = 500
-# Most flows of a part. More: their states leave the cache of the processor. Fewer: the calls of
-# small functions of a program take longer than what these do.
-_AT_ONCE = 3000
-# Bytes of the record of a part's moves. More: gigabytes in reverse mode. Fewer: many flows are
-# computed in more parts.
-_RECORD = 64e6
-# Bytes of the record of all flows that reverse mode keeps. More: gigabytes. Fewer: parts are
-# searched twice.
-_MOST_RECORDED = 5e8
-# Rows of the record with which many flows begin. More: flows of few steps fill rows in vain. Fewer:
-# flows of many steps are computed twice, and another program is compiled.
-_ROWS = 128
 
 
 @checked_methods
@@ -112,7 +100,7 @@ class Flow(Showable, eqx.Module):
     structure: Structure
     lanes: Lanes
     """Where it ended."""
-    request: "_Request"
+    request: Request
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -187,7 +175,7 @@ class Flow(Showable, eqx.Module):
             return charts[..., 0], states[..., 0, :]
         if self.trajectory is not None and not is_traced(times):
             return self._on_steps(np.asarray(times))
-        samples = _program(self.request, jnp.asarray(times)).samples
+        samples = sampled_passage(self.request, jnp.asarray(times)).samples
         depends = jnp.asarray(self.lane_results) == Result.SIMULTANEOUS
         chart = jnp.moveaxis(samples.chart, -1, 0)
         q = jnp.moveaxis(nan_where(depends, samples.q), -1, 0)
@@ -221,24 +209,6 @@ class Flow(Showable, eqx.Module):
             f"{many}: {Result(int(self.result)).message})"
         )
         return "\n".join([text, *print_findings(self.findings, "  ").splitlines()])
-
-
-class _Request(eqx.Module):
-    """What was asked for, with L lanes where they begin."""
-
-    system: HybridSystem
-    lanes: Lanes
-    result: Int[Array, " L"]
-    """Lanes whose code is not OK stay where they are."""
-    u: Float[Array, "nu #L"]
-    target: Target
-    settings: Settings
-    most_events: int = eqx.field(static=True)
-    new_input: bool = eqx.field(static=True)
-    many: bool = eqx.field(static=True)
-    """Whether the result has an axis of lanes."""
-    ends_in: int | None = eqx.field(static=True)
-    """Chart at the end, if it is known."""
 
 
 @checked
@@ -311,7 +281,7 @@ def flow(
         system, start, until, events, within, input, settings, max_events, max_steps
     )
     if request.many or is_traced(request):
-        found = _flows(request)
+        found = _result(request, passage_of(request), None)
     else:
         found = _on_host(request)
     if throw and not is_traced(found.result):
@@ -329,7 +299,7 @@ def requested(
     settings: Settings | None,
     max_events: int,
     max_steps: int | None,
-) -> _Request:
+) -> Request:
     """What is asked for.
 
     **Raises:** `DefinitionError` in the cases of `flow`.
@@ -359,7 +329,7 @@ def requested(
     if is_traced(system, lanes, until, within, u):
         lanes = jax.tree_util.tree_map(jnp.asarray, lanes)
     target, ends_in = _target_of(s, lanes, until, events, within)
-    return _Request(
+    return Request(
         system=system,
         lanes=lanes,
         result=result,
@@ -500,148 +470,10 @@ def _only_chart(s: Structure, section: Crossing | None = None) -> int | None:
     return next(iter(charts)) if len(dims) == 1 else None
 
 
-def _flows(request: _Request) -> Flow:
-    """The flows of all lanes by one program."""
-    if is_traced(request) or len(request.lanes.t) <= _FEW:
-        return _result(request, _program(request), None)
-    return _result(request, _with_enough_rows(request), None)
-
-
-def _with_enough_rows(request: _Request) -> Passage:
-    """The passage of many lanes. The record has few rows as long as these suffice, because rows
-    without moves take time, too."""
-    most = request.settings.max_steps
-    rows = min(_ROWS, most)
-    passage = _MANY(_with_rows(request, rows))
-    while rows < most and np.any(passage.moved.result == Result.STEP_LIMIT):
-        rows = min(4 * rows, most)
-        passage = _MANY(_with_rows(request, rows))
-    return passage
-
-
-def _with_rows(request: _Request, rows: int) -> _Request:
-    """What is asked for, with a record of so many rows."""
-    old = request.settings
-    settings = Settings(old.rtol, old.atol, rows, old.scale)
-    return dataclasses.replace(request, settings=settings)
-
-
-def _parts(request: _Request) -> Int[np.ndarray, "parts l"]:
-    """The lanes of each part of a flow, such that its record is not too large. The last part is
-    filled up with the last lane, so that all parts are of one size."""
-    L = len(request.lanes.t)
-    by_record = int(np.ceil(L * _bytes_of_record(request) / _RECORD))
-    by_cache = int(np.ceil(L / _AT_ONCE))
-    count = max(1, min(L, max(by_record, by_cache)))
-    size = -(-L // count)
-    return np.minimum(np.arange(count * size), L - 1).reshape(count, size)
-
-
-def _bytes_of_record(request: _Request) -> float:
-    """Bytes of the record of a flow's moves."""
-    lanes = request.lanes
-    record = jax.eval_shape(lambda: blank_tape(request.settings.max_steps, lanes))
-    return sum(x.size * x.dtype.itemsize for x in record) / len(lanes.t)
-
-
-def _some(request: _Request, lanes: Int[Array, " L"]) -> _Request:
-    """What is asked for of some lanes. (Arrays of one entry are for all lanes.)"""
-
-    def of(x):
-        return x[..., lanes] if x.shape[-1] > 1 else x
-
-    target, levels = request.target.split()
-    own = request.lanes, request.result, request.u, target
-    some, result, u, target = jax.tree_util.tree_map(of, own)
-    return dataclasses.replace(
-        request, lanes=some, result=result, u=u, target=target.with_levels(levels)
-    )
-
-
-def sampled(request: _Request, times: Float[Array, " K"]) -> tuple[Flow, Samples]:
+def sampled(request: Request, times: Float[Array, " K"]) -> tuple[Flow, Samples]:
     """A flow as a program, and samples of it."""
-    passage = _program(request, times)
+    passage = sampled_passage(request, times)
     return _result(request, passage, None), passage.samples
-
-
-def _passage(request: _Request, times: Float[Array, " K"] | None = None) -> Passage:
-    """The flow of all lanes, with samples at some times."""
-    s = Structure(request.system)
-    target = request.target
-    lanes = request.lanes._replace(events=request.lanes.events * 0)
-    request = dataclasses.replace(request, lanes=lanes)
-    times = jnp.zeros(0) if times is None else times
-    early = jnp.isfinite(target.time) & (target.time < lanes.t)
-    # (A time that is infinite or NaN is the limit, too.)
-    bad = early | ~jnp.isfinite(target.limit)
-    begin = update_result(request.result, bad, Result.BAD_INPUT)
-    request = dataclasses.replace(request, result=begin)
-    passage = _in_parts(request, times)
-    moved, events, _ = passage
-    late = _is_late(target, lanes, moved.lanes)
-    result = update_result(moved.result, late, Result.SECTION_MISSED)
-    coincide = _coincide(s, lanes, target, events)
-    result = update_result(result, coincide, Result.SIMULTANEOUS)
-    return passage._replace(moved=moved._replace(result=result))
-
-
-_program = quick_jit(_passage)
-# The same for many lanes, whose program runs longer than it compiles.
-_MANY = Program(_passage, loops=True)
-
-
-def _in_parts(request: _Request, times: Float[Array, " K"]) -> Passage:
-    """The passage of all lanes, part by part if their record would be too large. Reverse mode keeps
-    the record, or if that is too large, where each part starts: it searches and records it again.
-    """
-    parts = _parts(request)
-    if len(parts) == 1:
-        return _part(request, times)
-
-    def part(lanes):
-        return _part(_some(request, lanes), times)
-
-    L = len(request.lanes.t)
-    if L * _bytes_of_record(request) > _MOST_RECORDED:
-        part = jax.checkpoint(part)
-    passages = jax.lax.map(part, jnp.asarray(parts))
-
-    def joined(x):
-        x = jnp.moveaxis(x, 0, -2)
-        return x.reshape(*x.shape[:-2], parts.size)[..., :L]
-
-    return jax.tree_util.tree_map(joined, passages)
-
-
-def _part(request: _Request, times: Float[Array, " K"]) -> Passage:
-    """The passage of lanes whose record is small enough."""
-    return pass_through(
-        Structure(request.system),
-        request.lanes,
-        request.u,
-        request.target,
-        request.settings,
-        request.most_events,
-        request.new_input,
-        jnp.broadcast_to(times[:, None], (len(times), len(request.lanes.t))),
-        request.result,
-    )
-
-
-def _is_late(target: Target, begin: Lanes, end: Lanes) -> Bool[Array, " L"]:
-    """Test whether lanes ended later than they may: the last step can go on beyond the limit."""
-    return end.t > target.limit + SAME_TIME * (target.limit - begin.t)
-
-
-def _coincide(
-    s: Structure, lanes: Lanes, target: Target, events: Events
-) -> Bool[Array, " L"]:
-    """Test whether two events of a lane coincide, in programs, where their orders are not compared:
-    an event at once follows the one before on all trajectories."""
-    of_turn = rivals.Events(events.transition, events.t, events.at_once, events.rival)
-    span = jax.lax.stop_gradient(target.limit - lanes.t)
-    found = rivals.rivals_of(s, jax.lax.stop_gradient(of_turn), span) >= 0
-    return (found & ~events.at_once).any(axis=0)
 
 
 def _orders_differ(path: Trajectory, span: float) -> bool:
@@ -655,7 +487,7 @@ def _orders_differ(path: Trajectory, span: float) -> bool:
     return not all_commute(groups_on(path, rows, span, scale))
 
 
-def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flow:
+def _result(request: Request, passage: Passage, path: Trajectory | None) -> Flow:
     """The result of lanes at their ends."""
     s = Structure(request.system)
     moved = passage.moved
@@ -687,7 +519,7 @@ def _result(request: _Request, passage: Passage, path: Trajectory | None) -> Flo
     )
 
 
-def _on_host(request: _Request) -> Flow:
+def _on_host(request: Request) -> Flow:
     """A single flow, without a program, and checked."""
     s = Structure(request.system)
     lanes = request.lanes._replace(events=request.lanes.events * 0)
@@ -702,7 +534,7 @@ def _on_host(request: _Request) -> Flow:
         request.new_input,
     )
     span = float(request.target.limit[0] - lanes.t[0])
-    if path.result == Result.OK and _is_late(request.target, lanes, end)[0]:
+    if path.result == Result.OK and is_late(request.target, lanes, end)[0]:
         path = dataclasses.replace(path, result=Result.SECTION_MISSED)
     if path.result == Result.OK and _orders_differ(path, span):
         path = dataclasses.replace(path, result=Result.SIMULTANEOUS)

@@ -28,6 +28,7 @@ from .._core.showable import Showable
 from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
+from ..systems.system import name_of
 from .linear_flow import LinearFlow, linear_flow, rule
 from .responses import Phases, loop, surface
 from .return_map import SINGULAR
@@ -111,7 +112,7 @@ class Fluctuations(Showable, eqx.Module):
 
     def __repr__(self):
         system = self.structure.system
-        name = type(system).__name__
+        name = name_of(system)
         if is_traced(self):
             return f"Fluctuations({name}, traced)"
         unit = system.time_unit

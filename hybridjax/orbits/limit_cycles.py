@@ -36,7 +36,13 @@ from .._core.text import folded
 from ..engine.lanes import Lanes
 from ..engine.settings import SWEEP, Settings
 from ..errors import DefinitionError
-from ..systems.system import HybridSystem, arrays_of, copies_of, require_positive
+from ..systems.system import (
+    HybridSystem,
+    arrays_of,
+    copies_of,
+    name_of,
+    require_positive,
+)
 from .batches import Known, Rounds, Tiles, in_lanes, numbers_of, tiles_of
 from .checks import check_found, check_periodic
 from .coincidence import commutes
@@ -185,7 +191,7 @@ class LimitCycles(Showable, eqx.Module):
         return folded("; ".join(text))
 
     def __repr__(self):
-        kind = type(self.systems).__name__
+        kind = name_of(self.systems)
         return folded(f"LimitCycles({kind}: {self.summary(1)})")
 
 
@@ -308,7 +314,8 @@ def solved(
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
     together = _coincide(cycles, solver, tiles.map)
-    if len(left := solver.left):
+    left = solver.left
+    if len(left):
         near = _some_known(cycles) if known is None else known
         part = tiles_of(_some(systems, left), map, size, workers)
         rounds = part._replace(known=near).solve(len(left))
@@ -358,7 +365,8 @@ def _on_routes(systems: HybridSystem, solver: Solver, map: ReturnMap) -> LimitCy
         rows = np.flatnonzero(found.path == path)
         if not len(rows):
             continue
-        chart[rows], events[rows] = itinerary.charts, itinerary.begins
+        chart[rows] = itinerary.charts
+        events[rows] = itinerary.begins
         armed[rows] = itinerary.armed
         more = np.full((S, len(itinerary.events)), -1)
         more[rows] = itinerary.events
@@ -545,7 +553,7 @@ def _stacked(systems) -> HybridSystem:
     first, *_ = [systems] if isinstance(systems, HybridSystem) else [*systems, None]
     if first is not None and not arrays_of(first):
         raise DefinitionError(
-            f"{type(first).__name__} has no parameters, in which systems could differ: use "
+            f"{name_of(first)} has no parameters, in which systems could differ: use "
             "`find_limit_cycle` for the one that there is."
         )
     if isinstance(systems, HybridSystem):

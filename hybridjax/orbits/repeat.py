@@ -27,8 +27,9 @@ from .._core.executor import namespace, on_host, svdvals, to_host
 from .._core.results import Result, update_result
 from .._core.vector_math.factorizations import solve_by_columns
 from ..engine.arrays import Array
-from ..engine.itinerary.bodies import Travelers
-from ..engine.itinerary.rows import PIECES, Form, Itinerary, Rows, recorded
+from ..engine.itinerary.course import Travelers
+from ..engine.itinerary.recorded import recorded
+from ..engine.itinerary.rows import PIECES, Form, Itinerary, Rows
 from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, Tape, side_by_side
 from ..engine.unresolved import POLES, may_have_pulses

@@ -48,6 +48,7 @@ from ..engine.target import toward
 from ..errors import ComputationError, DefinitionError
 from ..systems.structure import Structure
 from ..systems.surfaces import SlidingChart
+from ..systems.system import name_of
 from .crossing import to_section
 from .linear_flow import NODES, LinearFlow, by_name, linear_flow
 from .return_map import SINGULAR, ReturnMap
@@ -221,13 +222,13 @@ class Responses(Showable, eqx.Module):
 
         **Raises:** `DefinitionError` for a cycle that is driven by a clock.
         """
-        scale = {
+        require_as_made(self.structure.system, _MADE)
+        scales = {
             "time": 1.0,
             "cycles": 1 / self.period,
             "radians": 2 * np.pi / self.period,
-        }[unit]
-        require_as_made(self.structure.system, _MADE)
-        return self._named(self._covector(None), phase, scale)
+        }
+        return self._named(self._covector(None), phase, scales[unit])
 
     def amplitude(self, mode: Index, phase: Phases) -> dict[str, Inexact[Array, " p"]]:
         """Change of the amplitude of a mode after a brief push at some phases, by names of states
@@ -343,7 +344,7 @@ class Responses(Showable, eqx.Module):
         return Coupling(c)
 
     def __repr__(self):
-        name = type(self.structure.system).__name__
+        name = name_of(self.structure.system)
         if is_traced(self):
             return f"Responses({name}, traced)"
         kinds = ["no phase (driven by a clock)" if self.of_phase is None else "phase"]
@@ -375,7 +376,7 @@ class Responses(Showable, eqx.Module):
         if mode is None:
             if self.of_phase is None:
                 raise DefinitionError(
-                    f"{type(self.structure.system).__name__} has no phase response: its phase is "
+                    f"{name_of(self.structure.system)} has no phase response: its phase is "
                     "that of its clock; use `amplitude`."
                 )
             return self.of_phase
@@ -457,7 +458,8 @@ def asymptotic_phase(
     period = float(cycle.period)
     s = map.structure
     a = map.structure.chart_index(chart)
-    lanes = begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
+    begin = lane_at(s, chart, state, map.anchor.t[0], "`state`")
+    lanes = begin
     phase = responses(cycle, 0)._covector(None)[0, 0]
     size = map.sizes
     near = np.sqrt(map.settings.rtol)  # its square is the error of a linear phase

@@ -24,6 +24,7 @@ from ..engine import kernels
 from ..errors import ComputationError
 from ..systems.quotient import check_symmetry
 from ..systems.structure import Structure
+from ..systems.system import name_of
 from ..systems.varied import Varied
 from .crossing import AtEvent, ListLevels
 from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
@@ -63,7 +64,7 @@ class Sensitivity(Showable, eqx.Module):
         return by_name(self.structure, chart, states)
 
     def __repr__(self):
-        name = type(self.structure.system).__name__
+        name = name_of(self.structure.system)
         if is_traced(self):
             return f"Sensitivity({name} to {self.parameter}, traced)"
         after = [*self.events[1:], *self.events[:1]]

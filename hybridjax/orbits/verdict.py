@@ -31,6 +31,7 @@ from ..engine.replay import recorded_moves
 from ..engine.saltation import jump
 from ..errors import DefinitionError
 from ..systems.structure import Structure
+from ..systems.system import name_of
 from ..systems.transition import Scheduled
 from .linear_flow import hosted, last_turn
 from .periodic import has_period
@@ -565,7 +566,7 @@ def _departure(cycle, path: _Path) -> list[Finding]:
     if path.distance <= max(_APART, errors_of_steps):
         return []
     text = (
-        f"a second integration of {type(cycle.system).__name__}, by another method, leaves the "
+        f"a second integration of {name_of(cycle.system)}, by another method, leaves the "
         f"cycle by {path.distance:.1g} (relative to the magnitudes of the states). Take smaller "
         "steps, e.g. `settings=Settings(rtol=1e-13)`, or look for a function that is not smooth."
     )

@@ -272,7 +272,7 @@ class Drive:
         rows = list[At]()
         ended = ""
         try:
-            if self.begun(seed) != self.begun(seed):
+            if self.first_signals(seed) != self.first_signals(seed):
                 raise ComputationError(
                     "the plant is not deterministic after `reset(seed)`"
                 )
@@ -289,7 +289,7 @@ class Drive:
             values.append([*outputs, x.late])
         return values, ended
 
-    def begun(self, seed: int) -> Sequence[float]:
+    def first_signals(self, seed: int) -> Sequence[float]:
         """Return the signals after the first steps."""
         self.reset(seed)
         self.pass_time(16 * self.dt)

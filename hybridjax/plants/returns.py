@@ -35,7 +35,7 @@ from .._core.text import listed
 from ..errors import ComputationError, DefinitionError
 from ..identify.denominator import coefficients_of
 from ..identify.multiplier_estimate import MultiplierFit
-from ..linear.multipliers import largest_first
+from ..linear.multipliers import conjugate_of, largest_first
 from ..sections import families
 from .drive import At
 
@@ -654,10 +654,8 @@ def _that_differ(found: _Eigenvalues) -> Int[np.ndarray, " k"]:
     """Return the indices of eigenvalues that differ from 0, the largest first. Of a conjugate pair,
     both or none are listed."""
     differs = np.abs(found.value) > _RESOLVED * found.error
-    for i in np.flatnonzero(differs):
-        distance = np.abs(found.value - found.value[i].conj())
-        twin = int(np.argmin(distance))
-        differs[i] = differs[i] and differs[twin]
+    for i in np.flatnonzero(differs).tolist():
+        differs[i] = differs[i] and differs[conjugate_of(found.value, i)]
     rows = np.flatnonzero(differs)
     return rows[largest_first(found.value[rows])]
 

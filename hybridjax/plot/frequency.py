@@ -18,6 +18,7 @@ from ..identify.rational import RationalFit
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
+from ..systems.system import name_of
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 
@@ -268,7 +269,7 @@ def _seconds(cycle: LimitCycle) -> float:
     unit = cycle.system.time_unit
     if unit and unit not in SECONDS:
         raise DefinitionError(
-            f"bode: the unit of time of {type(cycle.system).__name__}, '{unit}', is none of "
+            f"bode: the unit of time of {name_of(cycle.system)}, '{unit}', is none of "
             f"{', '.join(SECONDS)}: pass `period` in seconds."
         )
     return float(cycle.period) * SECONDS.get(unit, 1.0)

@@ -1,4 +1,17 @@
-"""Pictures of a trajectory: the shapes of `HybridSystem.draw`, where the motion has taken them."""
+"""Pictures of a trajectory: what `HybridSystem.draw` draws, on the ground, as a camera sees it.
+
+A model draws its body at an origin of its own, and says with each `Drawing` how fast this origin
+moves (`velocity`) and where in the drawing the body is (`place`). Three vectors follow in time:
+
+| | |
+|---|---|
+| `_origin` | where the origin is on the ground; at events it jumps such that the body stays |
+| `camera(t)` | where the camera is: at constant velocity, by one `stride` in each period |
+| their difference | by which each picture is shifted |
+
+If pictures jump at events, look at `_origin_along`; if a body leaves the window, at `stride`. The
+numbers of all drawings are computed by one program for each chart (`drawn`).
+"""
 
 import math
 from typing import Any
@@ -31,17 +44,12 @@ class Pictures:
         place = np.array([drawing.place for drawing in drawings])
         velocity = np.array([drawing.velocity for drawing in drawings])
 
-        # Over an event the body stays; between events the origin moves by its velocity.
-        durations = np.diff(t)[:, None]
-        mean_velocity = (velocity[1:] + velocity[:-1]) / 2
-        jumps = place[:-1] - place[1:]
-        moves = np.where(durations == 0, jumps, mean_velocity * durations)
-        origin = np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
-
+        origin = _origin_along(t, place, velocity)
         length = t[-1] - t[0]
         self.period = min(period, length)
-        moved = velocity[-1] * (self.period - length)
-        self.stride = origin[-1] + moved
+        # (The trajectory may be longer than a period.)
+        moved_too_far = velocity[-1] * (length - self.period)
+        self.stride = origin[-1] - moved_too_far
         if np.isinf(period):
             self.stride += place[-1] - place[0]
         self._t = t
@@ -67,12 +75,27 @@ class Pictures:
         return part[:, None] * self.stride
 
     def _seen(self, t, origin, drawings: list[Drawing]) -> list[Drawing]:
-        shift = origin - self.camera(t)
-        ways = np.pad(shift, ((0, 0), (0, 1)))  # (a radius stays)
-        return list(map(_moved, drawings, ways))
+        """The drawings as the camera sees them, with these origins on the ground."""
+        return list(map(_shifted, drawings, origin - self.camera(t)))
 
 
-def _moved(drawing: Drawing, way: Float[np.ndarray, "3"]) -> Drawing:
+def _origin_along(
+    t: Float[np.ndarray, " n"],
+    place: Float[np.ndarray, "n 2"],
+    velocity: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, "n 2"]:
+    """The origins of drawings on the ground: between events they move by their velocity, and at
+    events (of no duration) such that the body stays."""
+    durations = np.diff(t)[:, None]
+    mean_velocity = (velocity[1:] + velocity[:-1]) / 2
+    jumps = place[:-1] - place[1:]
+    moves = np.where(durations == 0, jumps, mean_velocity * durations)
+    return np.vstack([np.zeros(2), np.cumsum(moves, axis=0)])
+
+
+def _shifted(drawing: Drawing, shift: Float[np.ndarray, "2"]) -> Drawing:
+    # (Circles are x, y and a radius, which stays.)
+    way = np.append(shift, 0.0)
     return jax.tree_util.tree_map(lambda x: x + way[: x.shape[-1]], drawing)
 
 

@@ -38,6 +38,7 @@ from ..identify.multiplier_estimate import (
     Truth,
     compare_multipliers,
 )
+from ..linear.multipliers import conjugate_of, largest_first
 from .data import SectionData
 from .fit_warnings import about_natural_multipliers
 from .inspection.differences import alternating_cycles
@@ -229,17 +230,12 @@ def _covariances(
     for k, z in enumerate(values):
         drawn = draws[:, k]
         if z.imag:
-            mirrored = draws[:, _twin(values, k)].conj()
+            mirrored = draws[:, conjugate_of(values, k)].conj()
             both = np.concatenate([drawn, mirrored])
             covariances[k] = np.cov(both.real, both.imag)
         else:
             covariances[k, 0, 0] = drawn.real.var()
     return covariances
-
-
-def _twin(values: Complex[np.ndarray, " d"], k: int) -> int:
-    """Return the place of the other one of a pair."""
-    return int(np.argmin(np.abs(values - values[k].conj())))
 
 
 def _moduli(
@@ -250,7 +246,7 @@ def _moduli(
     than the modulus."""
     moduli = np.abs(draws)
     for k in np.flatnonzero(values.imag > 0).tolist():
-        twin = _twin(values, k)
+        twin = conjugate_of(values, k)
         square = moduli[:, k] * moduli[:, twin]
         common = np.sqrt(square)
         moduli[:, [k, twin]] = common[:, None]
@@ -547,13 +543,8 @@ def _multipliers(maps: Float[np.ndarray, "B N d d"]) -> Draws:
     companion = np.zeros((draws, d, d))
     companion[:, 0] = -mean[:, 1:]
     companion[:, 1:, :-1] = np.eye(d - 1)
-    roots = np.linalg.eigvals(companion)
-    return _largest_first(roots.astype(complex))
-
-
-def _largest_first(z: Draws) -> Draws:
-    order = np.argsort(-np.abs(z), axis=1, kind="stable")
-    return np.take_along_axis(z, order, axis=1)
+    roots = np.linalg.eigvals(companion).astype(complex)
+    return np.take_along_axis(roots, largest_first(roots), axis=1)
 
 
 def _corrected(

@@ -136,13 +136,14 @@ class Recording(Showable, eqx.Module):
         backwards, and infinite values, with the sample.
         """
         where = f"trial '{name}'"
+        if signals is None:
+            table = _table_of(where, time, "time", events, units)
+            time = table.time
+            signals = table.signals
+            events = table.events
+            units = table.units
         units = dict(units or {})
         events = dict(events or {})
-        if signals is None:
-            table = _table_of(where, time, "time")
-            time, signals = table.time, table.signals
-            events = table.events | events
-            units = table.units | units
         require_aligned(where, [time, *signals.values()])
         time = numbers(where, "time", time)
         if not signals:
@@ -195,12 +196,12 @@ class Recording(Showable, eqx.Module):
         **Raises:** `DefinitionError` if there is no such column, for an unknown unit of time, and
         as `Recording`; `FileFormatError` for two columns of one name.
         """
-        table = _table_of(f"trial '{name}'", frame, time)
+        table = _table_of(f"trial '{name}'", frame, time, events, units)
         return cls(
             table.time,
             table.signals,
-            events=table.events | dict(events or {}),
-            units=table.units | dict(units or {}),
+            events=table.events,
+            units=table.units,
             name=name,
         )
 
@@ -389,8 +390,15 @@ def _summary(trial: Trial) -> str:
     return folded("; ".join(parts), "  ")
 
 
-def _table_of(where: str, frame: Any, time: str) -> Table:
-    """Return times, signals and events of a table with named columns.
+def _table_of(
+    where: str,
+    frame: Any,
+    time: str,
+    events: Mapping[str, Any] | None,
+    units: Mapping[str, str] | None,
+) -> Table:
+    """Return times, signals and events of a table with named columns, with further events and
+    units.
 
     **Raises:** `DefinitionError` for data without columns, and in the cases of `parse_table`.
     """
@@ -400,7 +408,10 @@ def _table_of(where: str, frame: Any, time: str) -> Table:
             f"a column `{time}`."
         )
     columns = Columns({str(key): frame[key] for key in _names_of_columns(frame)})
-    return parse_table(where, columns, time)
+    table = parse_table(where, columns, time)
+    return table._replace(
+        events=table.events | dict(events or {}), units=table.units | dict(units or {})
+    )
 
 
 def _minus(curve: CubicSpline, level: float) -> Callable[[Series], Series]:

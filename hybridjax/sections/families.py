@@ -174,7 +174,8 @@ class ClockPhase(_Anchored):
     anchor: Crossing | Float[Array, ""]
 
     def __init__(self, n_sections: SectionCount, anchor: Crossing | Scalar = 0.0):
-        self.n_sections, self.anchor = n_sections, _as_anchor(anchor)
+        self.n_sections = n_sections
+        self.anchor = _as_anchor(anchor)
 
     def bind(self, s: Structure, orbit: Orbit) -> BoundSections:
         first = self._first(orbit.t[0], orbit.period)
@@ -225,7 +226,9 @@ class ArcLength(_Anchored):
         anchor: Crossing,
         scale: Annotated[Numbers, Reals("n", sign="positive")] | None = None,
     ):
-        self.n_sections, self.signals, self.anchor = n_sections, tuple(signals), anchor
+        self.n_sections = n_sections
+        self.signals = tuple(signals)
+        self.anchor = anchor
         ones = [1.0] * len(self.signals)
         self.scale = real(ones if scale is None else scale)
         require_axes("`scale`", self.scale, {"signals": len(self.signals)})

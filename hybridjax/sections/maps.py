@@ -28,6 +28,7 @@ from ..engine.lanes import nan_where
 from ..engine.move import move
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
+from ..systems.system import name_of
 from .place import as_placed
 from .placed import PlacedSections, SectionsLike, followed_at_once
 
@@ -70,7 +71,7 @@ class SectionMap(Showable, eqx.Module):
     """Dimensions n_i and n_j."""
 
     def __repr__(self):
-        system = type(self.placed.cycle.system).__name__
+        system = name_of(self.placed.cycle.system)
         states = how_many(self.dims[0], "state", "states")
         ends = " to ".join(map(self.placed.family.describe, (self.i, self.j)))
         return folded(f"SectionMap({system}: from {ends}; {states} to {self.dims[1]})")
@@ -96,10 +97,10 @@ class SectionMap(Showable, eqx.Module):
         held = np.zeros(nu) if u is None else u
         require_axes("`u`", held, {}, {"inputs": nu})
         arrival = _map(self, q, held, t)
-        if (
-            not is_traced(arrival)
-            and (code := Result(int(arrival.result))) != Result.OK
-        ):
+        if is_traced(arrival):
+            return arrival
+        code = Result(int(arrival.result))
+        if code != Result.OK:
             raise ComputationError(
                 f"{self.placed.family.describe(self.j)} is not reached from section {self.i}: "
                 f"{code.message}."
@@ -145,11 +146,10 @@ def section_map(
         require_index("section", k, placed.n_sections)
     s = placed.structure()
     chart = placed.lanes.chart
-    dims = (
-        (s.d, s.d)
-        if is_traced(chart)
-        else tuple(s.dims[k] for k in np.asarray(chart)[[i, j]])
-    )
+    dims = s.d, s.d
+    if not is_traced(chart):
+        first, last = np.asarray(chart)[[i, j]].tolist()
+        dims = s.dims[first], s.dims[last]
     return SectionMap(placed, i, j, dims)
 
 

@@ -40,7 +40,7 @@ from ..engine.watch import watch
 from ..orbits.checks import check_outputs
 from ..orbits.cycle import LimitCycle, orbit_picture
 from ..systems.structure import Outputs, Structure
-from ..systems.system import Output, OutputNames
+from ..systems.system import Output, OutputNames, name_of
 from .families import AbstractSections, BoundSections, FamilyLike
 
 
@@ -86,7 +86,7 @@ class PlacedSections(Showable, eqx.Module):
         return namespace(lanes.t).append(time, lanes.q[:, 0])
 
     def __repr__(self):
-        system = type(self.cycle.system).__name__
+        system = name_of(self.cycle.system)
         family = type(self.family).__name__
         count = how_many(self.n_sections, "section", "sections")
         head = f"PlacedSections({count} of a {family} on a cycle of {system}"

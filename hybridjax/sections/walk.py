@@ -24,8 +24,8 @@ from .._core.lanes import JACOBIAN_COLUMNS, by_jacobian
 from .._core.memo import Memory, Recent
 from .._core.results import Result
 from ..engine.arrays import Array
-from ..engine.itinerary.bodies import Travelers
-from ..engine.itinerary.rows import recorded_walk
+from ..engine.itinerary.course import Travelers
+from ..engine.itinerary.recorded import recorded_walk
 from ..engine.itinerary.turn import Passage, follow
 from ..engine.lanes import Lanes, pace_of
 from ..engine.target import AbstractLevels

@@ -25,7 +25,7 @@ from .._core.executor import is_traced
 from ..errors import DefinitionError
 from .chart import DerivedChart
 from .structure import as_vector
-from .system import Derived, Guess, HybridSystem, Output
+from .system import Derived, Guess, HybridSystem, Output, name_of
 from .transition import TOGETHER, Scheduled, Transition
 from .varied import parameter_of, with_parameters
 
@@ -403,7 +403,7 @@ def check_symmetry(
         if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
             once = f" once {along!r} changes" if along else ""
             raise DefinitionError(
-                f"{type(system.system).__name__} does not have the symmetry of its "
+                f"{name_of(system.system)} does not have the symmetry of its "
                 f"Symmetric{once}: {sentence}."
             )
 

@@ -1,6 +1,5 @@
 """What moves, and where it begins, as users give it: a system or its field, a state or a guess."""
 
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeAlias
 
@@ -11,7 +10,7 @@ from .._core.boundary.kinds import Numbers, Scalar
 from .._core.boundary.values import Plain, Reals
 from ..errors import DefinitionError
 from .structure import Structure
-from .system import Guess, HybridSystem
+from .system import Guess, HybridSystem, name_of, taken_by_position
 
 
 def _is_field(value: Any) -> bool:
@@ -57,12 +56,9 @@ def system_of(system: SystemLike, start: Any) -> HybridSystem:
 
 def _require_arguments(field: Callable, made: str) -> None:
     """**Raises:** `DefinitionError` for a field of other arguments than the time and the state."""
-    try:
-        parameters = inspect.signature(field).parameters.values()
-    except (TypeError, ValueError):  # of functions in C
+    names = taken_by_position(field)
+    if names is None:
         return
-    positional = [x for x in parameters if x.kind <= x.POSITIONAL_OR_KEYWORD]
-    names = [x.name for x in positional if x.default is x.empty]
     if len(names) > 2:
         raise DefinitionError(
             f"a field has the arguments (t, q), and not ({', '.join(names)}): inputs and "
@@ -118,7 +114,7 @@ def own_guess(system: HybridSystem) -> Guess:
     guess = jax.tree_util.tree_map(of_host, system).guess()
     if guess is None:
         raise DefinitionError(
-            f"{type(system).__name__} has no guess: pass `Guess(chart, state)`."
+            f"{name_of(system)} has no guess: pass `Guess(chart, state)`."
         )
     return guess
 

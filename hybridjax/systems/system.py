@@ -202,7 +202,7 @@ def require_positive(system: "HybridSystem") -> None:
             continue
         wrong = np.asarray(value)[~(np.asarray(value) > 0)]
         if wrong.size:
-            name = type(system).__name__
+            name = name_of(system)
             unit = field.metadata.get("unit", "")
             raise DefinitionError(
                 f"parameter `{field.name}` of {name} is {wrong.flat[0]:g} {unit}".rstrip()
@@ -527,21 +527,28 @@ def _with_parameters(function: Callable[..., Any], system: HybridSystem) -> Call
     return lambda t, q, u: function(*(t, q, u, system)[:count])
 
 
-def _count_taken(function: Callable[..., Any]) -> int:
-    """The number of (t, q, u, p) that a function takes; all of them where its signature is unknown,
-    or has no end."""
+def taken_by_position(function: Callable[..., Any]) -> list[str] | None:
+    """The names of the arguments that a field, a guard or a reset gets; None where its signature is
+    unknown, as of functions in C, or has no end."""
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):
-        return 4
+        return None
     if any(x.kind is x.VAR_POSITIONAL for x in parameters):
-        return 4
+        return None
     # (Others with defaults belong to the author, as k in `lambda t, q, k=k: ...`.)
     by_position = [x for x in parameters if x.kind <= x.POSITIONAL_OR_KEYWORD]
-    taken = [x for x in by_position if x.default is x.empty or x.name in ("u", "p")]
-    if len(taken) == 3 and taken[2].name == "p":  # (It would get the inputs.)
+    return [x.name for x in by_position if x.default is x.empty or x.name in ("u", "p")]
+
+
+def _count_taken(function: Callable[..., Any]) -> int:
+    """The number of (t, q, u, p) that a function takes."""
+    names = taken_by_position(function)
+    if names is None:
         return 4
-    return min(max(len(taken), 2), 4)
+    if len(names) == 3 and names[2] == "p":  # (It would get the inputs.)
+        return 4
+    return min(max(len(names), 2), 4)
 
 
 def integrated(system: HybridSystem, solver: Any) -> HybridSystem:

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import assume, given, settings, strategies as st
 from numpy.testing import assert_allclose
 
-from hybridjax.engine.cubic import first_crossing, halfway_cubic
+from hybridjax.engine.cubic import dips, first_crossing, halfway_cubic
 
 
 number = st.floats(-4.0, 4.0).map(lambda x: round(x, 3))
@@ -80,6 +80,17 @@ def test_a_dip_within_the_step_is_found():
     # (s - 0.4)^2 - 0.01: falls through zero at 0.3, rises at 0.5.
     found = crossing(0.15, 0.35, -0.8, 1.2)
     assert_allclose(found.position[0], 0.3, atol=1e-12)
+
+
+@given(v0=number, v1=number, d0=number, d1=number)
+@settings(max_examples=200, deadline=None)
+def test_a_dip_is_a_negative_minimum_between_positive_ends(v0, v1, d0, d1):
+    polynomial = cubic(v0, v1, d0, d1)
+    lowest = np.polyval(polynomial, np.linspace(0, 1, 1001)).min()
+    assume(abs(lowest) > 1e-4)
+    values = [np.array([x], float) for x in (v0, v1, d0, d1)]
+    expected = v0 > 0 and v1 > 0 and lowest < 0
+    assert dips(*values)[0] == expected
 
 
 def test_touching_and_nearly_touching():

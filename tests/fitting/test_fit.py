@@ -145,10 +145,9 @@ def test_times_of_autonomous_cycles_count_from_any_moment():
     (gap,), (other,) = (
         np.diff(hj.sections.place_sections(x, where).lanes.t) for x in cycles
     )
-    error, rough = (
-        np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3,
-        [],
-    )  # of a difference of two times
+    # The standard error of a difference of two times.
+    error = np.sqrt(2) * 0.1 / abs(other - gap) * 1e-3
+    rough = []
     for begin in (0.0, 9.0):
         data = hj.fitting.ObservedCycle(
             where, times=[begin, begin + gap], times_std=0.1
@@ -237,7 +236,8 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
 
 
 def test_advice_about_searches_names_their_function(oscillation):
-    still, data = Oscillator(w=0.0), observed(oscillation)
+    still = Oscillator(w=0.0)
+    data = observed(oscillation)
     far = hj.Guess("charge", (9e9, 0.0))
     free = ("p",)
     for call in (

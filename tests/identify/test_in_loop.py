@@ -141,7 +141,9 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
     )
     r = design.signals(208)[..., 0]
     faint = np.ones(8 * N)
-    faint[3::8] = faint[5::8] = 1e-3  # (the class 3/8 + integers)
+    # The class 3/8 + integers, and its mirror image.
+    faint[3::8] = 1e-3
+    faint[5::8] = 1e-3
     rng = np.random.default_rng(0)
     u, y = run(plant, r, 0 * r, rng)
     u, r, y = (np.fft.ifft(faint * np.fft.fft(z[:, -8 * N :])).real for z in (u, r, y))

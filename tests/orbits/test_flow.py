@@ -490,8 +490,8 @@ def test_a_guard_that_is_touched():
 @pytest.mark.slow
 def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
     """The last part is filled up; reverse mode of a program searches the parts again."""
-    monkeypatch.setattr("hybridjax.orbits.flow._FEW", 10)
-    monkeypatch.setattr("hybridjax.orbits.flow._RECORD", 4e5)
+    monkeypatch.setattr("hybridjax.orbits.flow_program._FEW", 10)
+    monkeypatch.setattr("hybridjax.orbits.flow_program._PART_BYTES", 4e5)
     height = np.linspace(0.5, 2.0, 14)
 
     def times(height):
@@ -500,12 +500,12 @@ def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
         # (5 to 21 rows of the record: the first 4 do not suffice.)
         return hj.flow(ball(), start, events=2, within=3.0).t
 
-    monkeypatch.setattr("hybridjax.orbits.flow._ROWS", 4)
+    monkeypatch.setattr("hybridjax.orbits.flow_program._FIRST_ROWS", 4)
     exact = np.sqrt(2 * height / 9.81) * 2.4
     assert_allclose(times(height), exact, rtol=1e-11)
     # Reverse mode keeps the record, or searches again if that is too large.
     for most in (5e8, 0.0):
-        monkeypatch.setattr("hybridjax.orbits.flow._MOST_RECORDED", most)
+        monkeypatch.setattr("hybridjax.orbits.flow_program._KEPT_BYTES", most)
         reverse = jax.jit(lambda x: jax.vjp(times, x)[1](jnp.ones(14))[0])
         assert_allclose(reverse(height), exact / (2 * height), rtol=1e-11)
 

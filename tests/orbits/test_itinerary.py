@@ -175,8 +175,9 @@ def test_gradients_inside_of_programs_are_differences():
     of_state = jax.grad(state, argnums=(0, 1, 2))
     gradient = jax.jit(of_state)(*at)
     for slope, step in zip(gradient, h * np.eye(3), strict=True):
-        higher = value(*(at + step))
-        change = higher - value(*(at - step))
+        above = at + step
+        below = at - step
+        change = value(*above) - value(*below)
         difference = change / (2 * h)
         assert_allclose(slope, difference, rtol=1e-6)
     jacobian = jax.jacfwd(state, argnums=(0, 1, 2))

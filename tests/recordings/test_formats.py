@@ -460,7 +460,8 @@ def memory_of(call):
 
 def test_a_packed_struct_is_refused_before_it_takes_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "unpacked", lambda size: 100 * size)
-    path, zeros = tmp_path / "x.mat", np.zeros(2**22)  # 32 MB
+    path = tmp_path / "x.mat"
+    zeros = np.zeros(2**22)  # 32 MB
     nested = {"imu": {"gyro": {"time": SLOW, "x": X, "more": zeros}}}
     write_v5(path, nested, do_compression=True)
     assert path.stat().st_size < 2**17

@@ -157,7 +157,8 @@ def test_the_mixed_model_maximizes_the_restricted_likelihood():
     y = of_condition + of_subject
     v = RNG.uniform(0.02, 0.2, (8, 2))
     present = np.ones((8, 2), bool)
-    present[0, 0] = present[1, 1] = False
+    present[0, 0] = False
+    present[1, 1] = False
     (subjects, cells) = np.nonzero(present)
     y = y[present]
     v = v[present]

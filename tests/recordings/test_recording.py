@@ -100,7 +100,10 @@ def test_csv_with_units_events_and_missing_samples(tmp_path):
     ],
 )
 def test_what_spreadsheets_write(tmp_path, text, encoding):
-    text = text.replace("\n", "\r\n" if ";" in text else "\r" if "\t" in text else "\n")
+    if ";" in text:
+        text = text.replace("\n", "\r\n")
+    elif "\t" in text:
+        text = text.replace("\n", "\r")
     (tmp_path / "x.csv").write_text(text, encoding=encoding, newline="")
     found = hj.read_recording(
         tmp_path / "x.csv", time="time_ms" if "_ms" in text else "time"

@@ -126,6 +126,16 @@ def test_what_is_no_symmetry_is_refused(system, symmetry, message):
             use(hj.systems.Symmetric(system, **symmetry))
 
 
+def test_messages_name_the_system_that_the_user_wrote():
+    def field(t, q):
+        return q[1], -(q[0] ** 3)
+
+    mine = hj.HybridSystem.from_functions(("x", "v"), field, name="Mine")
+    folded = hj.systems.Symmetric(mine, flipped=("x", "v"), half_period="x")
+    with pytest.raises(hj.errors.DefinitionError, match="Mine has no guess"):
+        hj.find_limit_cycle(folded)
+
+
 def test_an_odd_oscillator_closes_after_half_a_period():
     pol = hj.models.VanDerPol()
     duffing = hj.models.Duffing()

@@ -8,101 +8,57 @@ $R_q (v + f^- \delta) + R_t \delta + R_u w - f^+ \delta$: the saltation formula 
 F. R. Gantmacher, Quarterly J. Mechanics and Applied Mathematics 11, 1958). On a section they are
 $v + f \delta$ where the section is a level, and v where it is a time.
 
+| row | functions, in order |
+|---|---|
+| all that begin in a chart | `_observe` (field, watched functions), `_compare` (flags) |
+| STEP | `_departed` (length of the step, new columns), `_advanced` (the step), `_after_step` |
+| JUMP | `_aimed` (δ), `_shifted` (to the time of the event), `_reset` (saltation), `_ended` |
+| LEVEL | the same without `_reset` |
+| SCHEDULE, TIME | `_schedule`, `_time`: no field is needed |
+
 All rows that do the same share one piece of the program. Only the functions of a system (fields,
 guards, resets) are chosen among, by the number of the chart or of the kind of transition.
+Functions of one lane end with the arguments of a stage (`motion.py`): the structure, constants,
+what moves, and notes.
 """
 
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ...systems.structure import Kind, Member, Structure
 from ...systems.transition import SAME_TIME, Scheduled
 from ..arrays import Array
-from ..cubic import interpolate, root_near_end
-from ..settings import Settings
-from ..target import AbstractLevels
+from ..kernels import count_watched
 from . import steps
+from .course import Constants, Course, Travelers, padded_like
 from .flags import (
     Flags,
     Jumping,
-    Watched,
-    count_watched,
-    entered,
+    entry_of_jump,
+    flags_at_row,
     has_rival,
-    leveled,
-    noted,
-    still,
-    watched,
+    without_level,
 )
-from .motion import Alone, Motion, choose, chosen
+from .motion import Alone, Motion, choose, chosen, still
 from .rows import JUMP, LEVEL, NOTHING, SCHEDULE, STEP, TIME, Body, Form
-from .table import Row, Table
+from .table import Row
+from .watched import (
+    Watched,
+    watched_values,
+    with_predicates,
+)
 
 
 # Times of a schedule are equal if they differ by less than this part of its period. Larger: an
 # event that is due shortly before another one is left out. Smaller: rounding separates the
 # beginning of a leg from the tick with which it begins.
 _SAME_TICK = 10 * SAME_TIME
-
-
-class Course(NamedTuple):
-    """A trajectory on its way, with C columns; the state is padded to d numbers."""
-
-    t: Float[Array, ""]
-    y: Float[Array, "1+C d"]
-    """The state, then its columns."""
-    begin: Float[Array, ""]
-    """Time at which the present leg began."""
-    delay: Float[Array, " C"]
-    """Columns of the time of the last event, or of the arrival on a section."""
-    ends: Float[Array, " E"]
-    """Ends of legs: as guessed, and as found once they are past."""
-    rate: Float[Array, " d"]
-    """The field where the present row begins."""
-    value: Float[Array, ""]
-    """The watched function that the row brings to zero there, if it does,"""
-    slope: Float[Array, ""]
-    """and its rate along the flow."""
-    h: Float[Array, ""]
-    """The time that the row takes."""
-
-
-class Travelers(NamedTuple):
-    """Whose trajectories follow an itinerary: one system, or many in lanes.
-
-    Lanes stand on the first axis of arrays. Only what a row does is vectorized over them: JAX takes
-    many times as long to vectorize the loop over the rows.
-    """
-
-    of: Callable[[Any], Structure]
-    """The structure by its numbers."""
-    numbers: Any
-    """Of one system, or of all lanes."""
-    many: bool
-    structure: Structure
-    """With any numbers: those that it needs for nothing else."""
-
-    def each(self, function: Callable) -> Callable:
-        """A function of the numbers and further arrays of one lane, for all."""
-        return jax.vmap(function) if self.many else function
-
-
-class Constants(NamedTuple):
-    """Numbers that all rows use; see `follow`."""
-
-    numbers: Any
-    levels: AbstractLevels | None
-    settings: Settings
-    rows: Table
-    count: Int[Array, ""] | None  # type: ignore[assignment]  # (not the method of tuples)
-    begin: tuple
-    known: Float[Array, " E"] | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +95,7 @@ class Bodies:
         course, now = self._in_chart(motion, row, self._observe, course, flags.before)
         seen = still(motion.values(course)), now
         alone = Alone(motion.constants)
-        flags, due = alone.apply(self._lane(self._noted, row), flags, seen)
+        flags, due = alone.apply(self._lane(self._compare, row), flags, seen)
         does = {body.does for body in self.form.bodies}
         branches = []
         if STEP in does:
@@ -188,7 +144,8 @@ class Bodies:
         # (The steps of a leg that lasts no time on the recorded trajectory do not arrive later.)
         misses = course.ends[row.leg] - course.t
         course = course._replace(delay=jnp.zeros_like(course.delay))
-        return _arrived(row, course, leveled(row, flags), misses)
+        flags = flags._replace(before=without_level(row, flags.before))
+        return _arrived(row, course, flags, misses)
 
     # What a row sees where it begins.
 
@@ -196,18 +153,18 @@ class Bodies:
         self, a: int, row: Row, s: Structure, constants, course: Course, before: Watched
     ):
         """The field of chart a, and its watched functions, which had values `before`."""
-        q = _state(s, a, course)
+        q = course.state(s, a)
         t = course.t
         u = jnp.zeros(s.nu)
         field = steps.field(s, a, t, q)
         field_before = course.rate
-        course = course._replace(rate=_padded(field, course.rate))
+        course = course._replace(rate=padded_like(field, course.rate))
         padded = still(course.y[0])
         if not count_watched(s, a, constants.levels):
             return course, Watched.unknown(still(t), self.form.watched, padded)
 
         def values(t, q):
-            return watched(s, a, constants.levels, row, t, q, u)
+            return watched_values(s, a, constants.levels, row, t, q, u)
 
         along = (jnp.ones_like(t), field)
         value, rate = jax.jvp(values, (t, q), along)
@@ -219,14 +176,14 @@ class Bodies:
         enabled = jnp.ones(self.form.watched, bool)
         now = still(Watched(t, value, rate, enabled, ~enabled, padded))
         fields = still((field_before, course.rate))
-        now = _with_predicates(a, s, before, now, fields)
+        now = with_predicates(a, s, before, now, fields)
         return course, now
 
-    def _noted(self, row: Row, s: Structure, _, flags: Flags, seen):
-        """The flags, and the guards that are due."""
+    def _compare(self, row: Row, s: Structure, _, flags: Flags, seen):
+        """The flags, and the guards that are due at once."""
         course, now = seen
         duration = course.ends[row.leg] - course.begin
-        return noted(self.form, s, row, flags, now, duration)
+        return flags_at_row(self.form, s, row, flags, now, duration)
 
     # Steps.
 
@@ -245,7 +202,8 @@ class Bodies:
 
         On a section, the first one is that of the time: who begins later is behind by the flow.
         """
-        C, d = len(course.y) - 1, course.y.shape[1]
+        C = len(course.y) - 1
+        d = course.y.shape[1]
         delay = jnp.zeros(C)
         if self.inputs is None:
             unit = jnp.eye(C, d)
@@ -326,7 +284,7 @@ class Bodies:
         t = course.t + part * course.h
         used = y[:, : s.dims[a]]
         rates = steps.rates(s, a, t, used, self.inputs)
-        return _padded(course.h * rates, y), notes
+        return padded_like(course.h * rates, y), notes
 
     def _implicit_step(self, method, a: int, s: Structure, _, course: Course, notes):
         """The state and its columns after a step of chart a, and the error."""
@@ -335,7 +293,7 @@ class Bodies:
             s, a, method, course.t, y, course.h, self.inputs
         )
         state = course.y[0]
-        return _padded(end, course.y), _padded(still(error), state)
+        return padded_like(end, course.y), padded_like(still(error), state)
 
     # Ends of legs.
 
@@ -365,11 +323,11 @@ class Bodies:
         course = course._replace(h=jnp.zeros(()), delay=delay)
         if not count_watched(s, a, constants.levels):
             return course, notes
-        q = _state(s, a, course)
+        q = course.state(s, a)
         u = jnp.zeros(s.nu)
 
         def values(q, u):
-            return watched(s, a, constants.levels, row, course.t, q, u)
+            return watched_values(s, a, constants.levels, row, course.t, q, u)
 
         def along(v, w=u):
             _, changes = jax.jvp(values, (q, u), (v, w))
@@ -401,7 +359,7 @@ class Bodies:
         b = s.chart_index(tr.target)
         member = Member(kind, row.place)
         t = course.t
-        q = _state(s, a, course)
+        q = course.state(s, a)
         u = jnp.zeros(s.nu)
         at = still((t, q))
         notes = self._jumping(a, b, member, row, s, constants, at, notes)
@@ -420,7 +378,7 @@ class Bodies:
         before = course.y[1:, : s.dims[a]]
         columns = self._each(column, before, course.delay)
         y = jnp.concatenate([after[None], columns])
-        return course._replace(y=_padded(y, course.y)), notes
+        return course._replace(y=padded_like(y, course.y)), notes
 
     def _jumping(
         self, a: int, b: int, member: Member, row: Row, s, constants, at, notes
@@ -430,7 +388,7 @@ class Bodies:
         t, q = at
         pending = (now.value > 0) | jumping.due
         pending = pending & (jnp.arange(self.form.watched) != row.target)
-        entry = entered(s, a, b, constants.levels, row, t, q, pending)
+        entry = entry_of_jump(s, a, b, constants.levels, row, t, q, pending)
         no_input = jnp.zeros(s.nu)
         disabled = ~s.enabled(member, t, q, no_input)
         return now, jumping._replace(entry=entry, disabled=disabled)
@@ -441,7 +399,7 @@ class Bodies:
         rival = row.is_jump & has_rival(row, still(course.begin), now)
         at = still((course.t, course.y[0]))
         unknown = Watched.unknown(at[0], self.form.watched, at[1])
-        on_level = leveled(row, flags).before
+        on_level = without_level(row, flags.before)
         select = ft.partial(jnp.where, row.is_jump)
         before = jax.tree_util.tree_map(select, unknown, on_level)
         left = flags.left | rival | jumping.disabled
@@ -466,54 +424,6 @@ class Bodies:
 
 
 # Functions of one lane.
-
-
-def _state(s: Structure, a: int, course: Course) -> Float[Array, " n"]:
-    return course.y[0, : s.dims[a]]
-
-
-def _with_predicates(
-    a: int, s: Structure, before: Watched, now: Watched, fields: tuple
-) -> Watched:
-    """Watched functions of chart a with the predicates of their events, now and where they have
-    fallen through zero. `fields`: at the times before and now."""
-    predicates = [
-        (place, g)
-        for place, g in enumerate(s.guards(a))
-        if s.transitions[g].enabled is not None
-    ]
-    if not predicates:
-        return now
-    n = s.dims[a]
-    u = jnp.zeros(s.nu)
-    h = now.t - before.t
-    assert now.q is not None
-    enabled = jnp.asarray(now.enabled)
-    enabled_at_zero = jnp.asarray(now.enabled_at_zero)
-    for place, g in predicates:
-        values = before.value[place], now.value[place]
-        slope_before = h * before.rate[place]
-        slope_after = h * now.rate[place]
-        slopes = slope_before, slope_after
-        zero = root_near_end(*values, *slopes)
-        # (NaN where nothing is known of the time before.)
-        x = jnp.clip(jnp.nan_to_num(zero, nan=1.0), 0.0, 1.0)
-        state = interpolate(x, h, before.q, now.q, *fields)
-        time = before.t + x * h
-        holds = s.enabled(g, time, state[:n], u)
-        holds_now = s.enabled(g, now.t, now.q[:n], u)
-        enabled = enabled.at[place].set(holds_now)
-        enabled_at_zero = enabled_at_zero.at[place].set(holds)
-    return now._replace(enabled=enabled, enabled_at_zero=enabled_at_zero)
-
-
-def _padded(
-    x: Float[Array, "*C n"], like: Float[Array, "*C d"]
-) -> Float[Array, "*C d"]:
-    """`x` with zeros for numbers that a chart does not use."""
-    more = like.shape[-1] - x.shape[-1]
-    kept = [(0, 0)] * (x.ndim - 1)
-    return jnp.pad(x, kept + [(0, more)]) if more else x
 
 
 def _after_step(_, moving, notes):

@@ -1,6 +1,25 @@
-"""Flags: how well a trajectory follows its itinerary, by its watched functions."""
+"""Flags: whether a trajectory still follows its itinerary.
 
-from typing import Any, NamedTuple
+A program cannot search again. It compares the trajectory with the recorded one, and reports in
+`Flags.left` if one of these tests was ever true:
+
+| where | the itinerary is left if | tested in |
+|---|---|---|
+| first row of a leg | a function is not positive that was | `_differs_at_begin` |
+| | another guard is due at once than before, or none | `_differs_at_once` |
+| later rows | a function has fallen through zero, even if it came back | `_falls_within` |
+| last rows of a leg | its guard or level does not fall through zero | `_misses_target` |
+| event | another event may come first | `has_rival` |
+| | its predicate does not hold | `Bodies._jumping` |
+| any | a leg ends before it begins, or a scheduled event was due | `_arrived`, `_has_tick` |
+
+(The last three are in `bodies.py`.) A guard is *due at once* if its event happens at the time of
+the event before: see `engine.events.rearm`, which is the same rule in a search. If a trajectory
+leaves without need, find out which test is true; `Plan.code` in `orbits/repeat.py` turns the flags
+into a `Result`.
+"""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,201 +28,185 @@ from jaxtyping import Bool, Float, Int
 from ...systems.structure import Structure
 from ...systems.transition import SAME_TIME, TOGETHER
 from ..arrays import Array
+from ..cubic import dips
+from ..events import Entry
 from ..settings import ROUNDING
 from ..target import AbstractLevels
 from .rows import Form
 from .table import Row
+from .watched import Watched, watched_values
 
 
 class Flags(NamedTuple):
     """How well a trajectory follows its itinerary. Flags have no derivatives."""
 
-    before: "Watched"
-    """Watched functions where the last row began, and since then."""
-    entry: "Entry"
-    """Guards of the chart that the last jump has entered, in the chart before."""
+    before: Watched
+    """Watched functions where the last row began."""
+    entry: Entry
+    """Guards of the chart that the last jump has entered, compared with the chart before."""
     error: Float[Array, ""]
     """Largest estimated error of a step so far, relative to what is allowed."""
     last: Float[Array, ""]
     """Largest last correction of the time of an event."""
     left: Bool[Array, ""]
-    """Whether the itinerary was left: a watched function has passed zero where it should not."""
-
-
-class Watched(NamedTuple):
-    """The watched functions of a chart, and their rates along the flow, at a time."""
-
-    t: Float[Array, ""]
-    value: Float[Array, " G"]
-    rate: Float[Array, " G"]
-    enabled: Bool[Array, " G"] | bool = True
-    """Whether their events are enabled."""
-    enabled_at_zero: Bool[Array, " G"] | bool = False
-    """Whether they were where the functions fell through zero, since the time before."""
-    q: Float[Array, " d"] | None = None
-    """The state."""
-
-    @classmethod
-    def unknown(
-        cls, t: Float[Array, ""], width: int, q: Float[Array, " d"]
-    ) -> "Watched":
-        """Watched functions of which nothing is known, of a state."""
-        far = jnp.full(width, jnp.inf)
-        enabled = jnp.ones(width, bool)
-        return cls(t, far, jnp.ones(width), enabled, ~enabled, q)
-
-
-class Entry(NamedTuple):
-    """Guards of a chart that a jump enters, as far as the chart before has them, too."""
-
-    known: Bool[Array, " G"]
-    """Whether it has this guard: it is the same chart, or has one of the same value."""
-    armed: Bool[Array, " G"]
-    """Whether that guard was still to fall."""
-
-    @classmethod
-    def departure(cls, width: int) -> "Entry":
-        """That of the beginning of a trajectory: no guard is due there."""
-        nothing = jnp.zeros(width, bool)
-        return cls(known=~nothing, armed=nothing)
-
-    @classmethod
-    def unknown(cls, width: int) -> "Entry":
-        """That of a chart whose guards the chart before has not."""
-        nothing = jnp.zeros(width, bool)
-        return cls(known=nothing, armed=nothing)
+    """Whether the itinerary was left."""
 
 
 class Jumping(NamedTuple):
-    """What is noted of a jump while it happens."""
+    """Notes of a jump while it happens."""
 
     due: Bool[Array, " G"]
-    """Guards whose events happen at once where the last jump has led."""
+    """Guards that are due at once where the last jump has led."""
     entry: Entry
     disabled: Bool[Array, ""]
     """Whether the event's predicate does not hold."""
 
 
-def watched(
-    s: Structure, a: int, levels: AbstractLevels | None, row: Row, t, q, u
-) -> Float[Array, " g"]:
-    """The watched functions of chart a: its guards, and the level of the row's section."""
-    from ..kernels import watched_at
-
-    kinds = s.guard_kinds(a)
-    return watched_at(a, kinds, s, levels, t, q, u, row.section)
+# Where a row begins.
 
 
-def count_watched(s: Structure, a: int, levels: AbstractLevels | None) -> int:
-    has_level = levels is not None and levels.present(s, a)
-    return len(s.guards(a)) + has_level
-
-
-def noted(
+def flags_at_row(
     form: Form, s: Structure, row: Row, flags: Flags, now: Watched, duration
 ) -> tuple[Flags, Bool[Array, " G"]]:
-    """The flags at a row, where watched functions have these values, and the guards that are due
-    there. `duration`: of the leg."""
-    counts = [len(s.guards(a)) for a in form.charts]
-    guards = jnp.asarray(counts)[row.chart]
-    is_guard = jnp.arange(form.watched) < guards
-    due = is_guard & _is_due(flags, now, duration)
-    is_new = due.any() & ~row.at_once
-    lost = row.at_once & ~row.scheduled
-    if due.size:
-        lost = lost & ~due[_fired(form, s, row)]
-    has_left = _has_left(row, flags.before, now)
-    left = flags.left | is_new | lost | has_left
+    """The flags after a comparison with the recorded signs of a row, and the guards that are due at
+    once.
+
+    **Arguments:** `now`: watched functions where the row begins. `duration`: of the leg.
+    """
+    due = _is_due(flags, now, duration)
+    due = due & _is_guard(form, s, row)
+    has_left = (
+        _differs_at_begin(row, flags.before, now)
+        | _differs_at_once(form, s, row, due)
+        | _falls_within(row, flags.before, now)
+        | _misses_target(row, flags.before, now)
+    )
     # (Where a reset puts the state on a guard, rounding gives this guard a sign. It does not fall
     # through its zero there, as it did not on the recorded trajectory.)
-    zero = SAME_TIME * duration * jnp.abs(now.rate)
-    at_zero = jnp.abs(now.value) <= zero
+    at_zero = jnp.abs(now.value) <= _rounding(now, duration)
     on_guard = (row.signs == 0) & at_zero
-    value = jnp.where(on_guard, 0.0, now.value)
-    before = now._replace(value=value)
-    return flags._replace(before=before, left=left), due
+    before = now._replace(value=jnp.where(on_guard, 0.0, now.value))
+    return flags._replace(before=before, left=flags.left | has_left), due
+
+
+def _is_guard(form: Form, s: Structure, row: Row) -> Bool[Array, " G"]:
+    """Whether watched functions are guards of the row's chart."""
+    counts = [len(s.guards(a)) for a in form.charts]
+    return jnp.arange(form.watched) < jnp.asarray(counts)[row.chart]
+
+
+def _rounding(now: Watched, duration) -> Float[Array, " G"]:
+    """Changes of watched functions during the rounding error of a time."""
+    return SAME_TIME * duration * jnp.abs(now.rate)
 
 
 def _is_due(flags: Flags, now: Watched, duration) -> Bool[Array, " G"]:
-    """Test whether events of guards happen at once where a jump has led (see
-    `engine.events.rearm`): of those beyond zero that fall and are new, or were still to fall."""
+    """Test whether guards below zero are due at once where a jump has led: those that fall and are
+    new in this chart, or that were still to fall in the chart before."""
     entry = flags.entry
-    begins = jnp.isinf(flags.before.value)
+    begins = flags.before.is_unknown
     falls = now.rate < 0
-    beyond = now.value < -SAME_TIME * duration * jnp.abs(now.rate)
+    beyond = now.value < -_rounding(now, duration)
     is_new = falls & ~entry.known
     was_to_fall = entry.armed & (falls | beyond)
     crossed = is_new | was_to_fall
     return begins & (now.value < 0) & crossed & now.enabled
 
 
-def _fired(form: Form, s: Structure, row: Row) -> Int[Array, ""]:
-    """The place of the guard of a jump among those of its chart."""
+def _differs_at_once(
+    form: Form, s: Structure, row: Row, due: Bool[Array, " G"]
+) -> Bool[Array, ""]:
+    """Test whether a guard is due at once in a row that is no jump at once, or the guard of such a
+    row is not. (Scheduled events have no guard.)"""
+    is_new = due.any() & ~row.at_once
+    if not due.size:
+        return is_new
+    is_lost = row.at_once & ~row.scheduled & ~due[_place_of_guard(form, s, row)]
+    return is_new | is_lost
+
+
+def _place_of_guard(form: Form, s: Structure, row: Row) -> Int[Array, ""]:
+    """The place of a jump's guard among the watched functions of its chart."""
     places = []
     for kind in form.kinds:
         source = s.transitions[kind[0]].source
         guards = s.guards(s.chart_index(source))
         places.append([guards.index(g) if g in guards else 0 for g in kind])
-    most = max(map(len, places), default=1)
-    table = [x + [0] * (most - len(x)) for x in places]
-    # (The last row is for rows that are no jump.)
-    table.append([0] * most)
+    # (The last line is for rows that are no jump.)
+    places.append([0])
+    longest = max(map(len, places))
+    table = [x + [0] * (longest - len(x)) for x in places]
     return jnp.asarray(table)[row.kind, row.place]
 
 
-def _has_left(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
-    """Test whether the itinerary is left between the row before and this one.
+def _compared(row: Row) -> Bool[Array, " G"]:
+    """Whether watched functions have a recorded sign, and do not end the leg."""
+    is_target = jnp.arange(len(row.signs)) == row.target
+    return (row.signs != 0) & ~is_target
 
-    - Where a leg begins, functions that were positive must be positive. One that was negative may
-      have risen sooner, except at an event at once.
-    - Within a leg, none may fall through zero, also if it comes back; one may rise sooner or later
-      than recorded. (A fall is no event where its predicate does not hold.)
-    - The one at whose zero the leg ends must have been positive, and must fall.
-    """
-    places = jnp.arange(len(row.signs))
-    known = (row.signs != 0) & (places != row.target)
-    begins = jnp.isinf(before.value)
-    within = known & ~begins
-    signs = jnp.sign(now.value)
+
+def _differs_at_begin(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
+    """Test whether a leg begins where functions have other signs than recorded. One that was
+    negative may have risen sooner, except at an event at once."""
+    must_agree = _compared(row) & ((row.signs > 0) | row.at_once)
     # (Comparisons with NaN are false.)
-    as_recorded = signs * row.signs > 0
-    compared = known & ((row.signs > 0) | row.at_once)
-    other = begins & compared & ~as_recorded
-    unknown = within & ~jnp.isfinite(now.value)
-    returns = within & dips(before, now, signs)
-    was_positive = before.value > 0
-    falls = within & was_positive & ~(now.value > 0)
+    agrees = jnp.sign(now.value) * row.signs > 0
+    return (before.is_unknown & must_agree & ~agrees).any()
+
+
+def _falls_within(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
+    """Test whether a function has fallen through zero since the row before, even if it came back.
+    It may rise sooner or later than recorded, and a fall is no event where its predicate does not
+    hold."""
+    h = now.t - before.t
+    is_positive = now.value > 0
+    falls = (before.value > 0) & ~is_positive
     enabled = before.enabled | now.enabled | now.enabled_at_zero
-    happens = falls & enabled
-    left = (other | unknown | returns | happens).any()
-    return left | _misses(row, before, now)
+    sign = jnp.sign(now.value)
+    values = sign * before.value, sign * now.value
+    slopes = h * sign * before.rate, h * sign * now.rate
+    comes_back = dips(*values, *slopes)
+    is_lost = ~jnp.isfinite(now.value)
+    left = (falls & enabled) | comes_back | is_lost
+    return (_compared(row) & ~before.is_unknown & left).any()
 
 
-def _misses(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
-    """Test whether the function at whose zero a leg ends does not fall to it. (The row of its first
-    correction has its sign in the row before.)"""
+def _misses_target(row: Row, before: Watched, now: Watched) -> Bool[Array, ""]:
+    """Test whether the function at whose zero a leg ends was not positive, or does not fall. (The
+    row of its first correction has its sign in the row before.)"""
     if not now.value.size:
         return jnp.asarray(False)
     ends_at_zero = row.target >= 0
-    value = before.value[row.target]
-    sign = row.signs[row.target]
-    was_positive = (value > 0) | (sign <= 0)
+    was_positive = (before.value[row.target] > 0) | (row.signs[row.target] <= 0)
     falls = now.rate[row.target] < 0
     return ends_at_zero & ~(was_positive & falls)
 
 
+# Events.
+
+
 def has_rival(row: Row, begin, now: Watched) -> Bool[Array, ""]:
     """Test whether another function falls to zero where an event happens, so that it may come first
-    (see `Tape.rival`)."""
-    places = jnp.arange(len(row.signs))
-    other = (row.signs > 0) & (places != row.target)
+    (see `Tape.rival`).
+
+    **Arguments:** `begin`: time at which the leg began.
+    """
+    is_target = jnp.arange(len(row.signs)) == row.target
+    other = (row.signs > 0) & ~is_target
     duration = now.t - begin
     close = TOGETHER * duration * jnp.abs(now.rate)
     falls = (now.rate < 0) & (now.value <= close)
     return (other & falls & now.enabled).any()
 
 
-def entered(
+def entry_at_departure(width: int) -> Entry:
+    """The guards where a trajectory begins: as if all had been known and had fallen, so that none
+    is due at once."""
+    none = jnp.zeros(width, bool)
+    return Entry(known=~none, armed=none)
+
+
+def entry_of_jump(
     s: Structure,
     a: int,
     b: int,
@@ -213,68 +216,42 @@ def entered(
     q: Float[Array, " n"],
     pending: Bool[Array, " G"],
 ) -> Entry:
-    """The guards of chart b, from where a jump of chart a leads there. `pending`: guards of chart a
-    that were still to fall, besides that of the jump.
+    """The guards of chart b, from where a jump of chart a leads there. A guard of b is known if one
+    of a has the same value before the jump, but for rounding.
 
-    A guard of b is known if one of a has the same value before the jump, but for rounding.
+    **Arguments:** `q`: the state before the jump. `pending`: guards of chart a that were still to
+    fall, besides that of the jump.
     """
     width = len(pending)
     if a == b:
-        return Entry(jnp.ones(width, bool), pending)
+        return Entry(known=jnp.ones(width, bool), armed=pending)
     have_guards = s.guards(a) and s.guards(b)
     if s.dims[a] != s.dims[b] or not have_guards:
-        return Entry.unknown(width)
+        none = jnp.zeros(width, bool)
+        return Entry(known=none, armed=none)
 
-    def values(chart, q):
+    def guards(chart, q):
         no_input = jnp.zeros(s.nu)
-        functions = watched(s, chart, levels, row, t, q, no_input)
-        return functions[: len(s.guards(chart))]
+        values = watched_values(s, chart, levels, row, t, q, no_input)
+        return values[: len(s.guards(chart))]
 
-    own = values(a, q)
-    others = values(b, q)
-    slopes = jax.jacfwd(values, 1)(b, q)
+    of_a = guards(a, q)
+    of_b = guards(b, q)
+    slopes = jax.jacfwd(guards, 1)(b, q)
     terms = jnp.abs(slopes) @ jnp.abs(q)
-    noise = ROUNDING * (terms + jnp.abs(others))
-    apart = jnp.abs(others[:, None] - own)
+    noise = ROUNDING * (terms + jnp.abs(of_b))
+    apart = jnp.abs(of_b[:, None] - of_a)
     equal = apart <= noise[:, None]
-    still_to_fall = pending[: len(own)]
     known = equal.any(axis=1)
-    armed = (equal & still_to_fall).any(axis=1)
-    more = (0, width - len(others))
+    armed = (equal & pending[: len(of_a)]).any(axis=1)
+    more = (0, width - len(of_b))
     return Entry(known=jnp.pad(known, more), armed=jnp.pad(armed, more))
 
 
-def leveled(row: Row, flags: Flags) -> Flags:
-    """Flags on a section: of the level of the next one nothing is known. (Charts without a level
-    have no such row: nothing is set.)"""
-    value = flags.before.value
+def without_level(row: Row, before: Watched) -> Watched:
+    """Watched functions on a section: nothing is known of the level of the next section. (Charts
+    without a level have no such row: nothing is set.)"""
+    value = before.value
     if value.size:
         value = value.at[row.target].set(jnp.inf, mode="drop")
-    return flags._replace(before=flags.before._replace(value=value))
-
-
-def still(tree: Any) -> Any:
-    return jax.lax.stop_gradient(tree)
-
-
-def dips(before: Watched, now: Watched, signs) -> Bool[Array, " G"]:
-    """Test whether functions with these signs at two times have had the other one in between:
-    whether the cubic polynomials with their values and rates have."""
-    h = now.t - before.t
-    first = signs * before.value
-    last = signs * now.value
-    slope0 = h * signs * before.rate
-    slope1 = h * signs * now.rate
-    # The polynomial first + slope0 x + second x^2 + third x^3 of the part x of the time.
-    rise = last - first
-    third = slope0 + slope1 - 2 * rise
-    second = 3 * rise - 2 * slope0 - slope1
-    # Its minimum is at the larger root of its derivative.
-    discriminant = second**2 - 3 * third * slope0
-    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    place = -slope0 / (second + root)
-    within = (place > 0) & (place < 1)
-    bend = second + place * third
-    lowest = first + place * (slope0 + place * bend)
-    positive = (first > 0) & (last > 0)
-    return jax.lax.stop_gradient(positive & within & (lowest < 0))
+    return before._replace(value=value)

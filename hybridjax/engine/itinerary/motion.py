@@ -1,8 +1,17 @@
-"""What moves, alone or with its derivatives: the same stages serve both.
+"""Stages, which serve trajectories alone and trajectories with their derivatives.
 
-A stage is a function `moving, notes = stage(constants, moving, notes)`; notes have no derivatives.
-Derivatives of a choice among stages are those of the stages: JAX takes many times as long to
-differentiate the choice.
+A row of an itinerary is done in stages, `moving, notes = stage(constants, moving, notes)`. Here,
+`moving` are numbers that have derivatives, such as the `Course` of a trajectory, and `notes` are
+numbers that have none, such as its `Flags`. Code that chains stages takes a `Motion`:
+
+| | `Alone` | `InDirections` |
+|---|---|---|
+| `moving` is | the values | the pair (values, derivatives), directions on the first axis |
+| `apply(stage, ...)` | calls the stage | calls it, and pushes the derivatives forward |
+| `pack(x)` of x (...) | x | one array (1 + directions, ...) |
+
+The derivative of a choice among stages is the choice among derivatives (`choose`): JAX would take
+many times as long to differentiate the choice itself.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,27 +28,27 @@ Stage: TypeAlias = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 class Alone(NamedTuple):
-    """What moves has its values only."""
+    """Values only."""
 
     constants: Any
 
     def apply(self, stage: Stage, moving: Any, notes: Any) -> tuple[Any, Any]:
-        """What moves, and the notes, after a stage."""
+        """`moving` and `notes` after a stage."""
         return stage(self.constants, moving, notes)
 
     def part(self, moving: Any, name: str) -> Any:
-        """A field of what moves."""
+        """The field `name` of `moving`."""
         return getattr(moving, name)
 
     def join(self, *moving: Any) -> Any:
-        """A tuple of what moves."""
+        """Several `moving` as one, whose values are a tuple."""
         return moving
 
     def values(self, moving: Any) -> Any:
         return moving
 
     def pack(self, moving: Any) -> Array:
-        """One array of what moves."""
+        """`moving` as one array."""
         return moving
 
     def unpack(self, moving: Array) -> Any:
@@ -47,31 +56,31 @@ class Alone(NamedTuple):
 
 
 class InDirections(NamedTuple):
-    """What moves is a pair: its values, and their derivatives in directions on the first axis."""
+    """Values, and their derivatives in directions on the first axis."""
 
     constants: Any
     by_constants: Any
 
     def apply(self, stage: Stage, moving: Any, notes: Any) -> tuple[Any, Any]:
-        """What moves, and the notes, after a stage."""
+        """`moving` and `notes` after a stage."""
         values, columns = moving
         constants = self.constants, self.by_constants
         values, columns, notes = pushed(stage, *constants, values, columns, notes)
         return (values, columns), notes
 
     def part(self, moving: Any, name: str) -> Any:
-        """A field of what moves."""
+        """The field `name` of `moving`."""
         return tuple(getattr(x, name) for x in moving)
 
     def join(self, *moving: Any) -> Any:
-        """A tuple of what moves."""
+        """Several `moving` as one, whose values are a tuple."""
         return tuple(zip(*moving, strict=True))
 
     def values(self, moving: Any) -> Any:
         return moving[0]
 
     def pack(self, moving: Any) -> Array:
-        """One array of what moves: the values, then their derivatives."""
+        """`moving` as one array: the values, then their derivatives."""
         values, columns = moving
         return jnp.concatenate([values[None], columns])
 
@@ -89,7 +98,7 @@ def choose(
     moving: Any,
     notes: Any = None,
 ) -> tuple[Any, Any]:
-    """What moves, and the notes, after the stage with this number."""
+    """`moving` and `notes` after the stage with this number."""
 
     def branch(stage: Stage) -> Callable:
         return lambda moving, notes: motion.apply(stage, moving, notes)
@@ -102,3 +111,8 @@ def chosen(index: Int[Array, ""], branches: Sequence[Callable], *arguments: Any)
     if len(branches) == 1:
         return branches[0](*arguments)
     return jax.lax.switch(index, branches, *arguments)
+
+
+def still(tree: Any) -> Any:
+    """The same numbers without derivatives, for notes."""
+    return jax.lax.stop_gradient(tree)

@@ -1,7 +1,16 @@
-"""A step of a chart, with its derivative columns beside the state.
+"""One step of a chart: the end of the step, and its estimated error.
 
-Steps of explicit methods are those of a solver of diffrax. For implicit methods, this package
-solves for the stages, by iterations that carry derivatives.
+A step moves an array y (1 + C, n), whose rows are
+
+| row | | obeys |
+|---|---|---|
+| 0 | the state q | q' = f(t, q, 0) |
+| 1 to C | columns v: derivatives of q in some directions | v' = f_q v + f_u w, with w in `inputs` |
+
+`unit_step` takes explicit steps, with a solver of diffrax; `rates` has the right sides above.
+`implicit_step` solves for the stages of an implicit method, by iterations that carry derivatives.
+If states are right and derivatives are wrong, look in `rates`, or in the two last Newton steps of
+`implicit_step`.
 """
 
 import functools as ft
@@ -15,7 +24,7 @@ from jaxtyping import Array, Float
 
 from ...systems.solver import Method
 from ...systems.structure import Structure
-from ..runge_kutta import StageEquations, errors, increments
+from ..runge_kutta import StageEquations, errors, increments, with_derivatives
 
 
 # Change at which Newton's method for the stages of a state ends, relative to its size. Larger: two
@@ -34,9 +43,11 @@ def solver_of(method: Method, reverse: bool = False) -> Solver:
     """
     if method.implicit:
         return method
+    # (Importing diffrax takes a second, which only programs need.)
     import diffrax
 
-    a, c = np.array(method.a), np.array(method.c)
+    a = np.array(method.a)
+    c = np.array(method.c)
     coefficients = diffrax.ButcherTableau(
         a_lower=tuple(a[i, :i] for i in range(1, len(c))),
         b_sol=np.array(method.b),
@@ -56,28 +67,45 @@ def solver_of(method: Method, reverse: bool = False) -> Solver:
     return Explicit(scan_kind="bounded" if reverse else "lax")
 
 
-def field(s: Structure, a: int, t, q) -> Float[Array, " n"]:
+def is_implicit(solver: Solver) -> bool:
+    return isinstance(solver, Method)
+
+
+# Right sides.
+
+
+def field(s: Structure, a: int, t, q: Float[Array, " n"]) -> Float[Array, " n"]:
     """The field of chart a, without inputs."""
     return s.field(a, t, q, jnp.zeros(s.nu))
 
 
 def rates(
-    s: Structure, a: int, t, y: Float[Array, "1+C n"], inputs
+    s: Structure,
+    a: int,
+    t,
+    y: Float[Array, "1+C n"],
+    inputs: Float[Array, "C nu"] | None,
 ) -> Float[Array, "1+C n"]:
     """Rates of a state and of its columns.
 
-    **Arguments:** `inputs`: of each column; None if there are none.
+    **Arguments:** `inputs`: the constant input in the direction of each column; None for columns
+    without inputs.
     """
-    if len(y) == 1:
-        return field(s, a, t, y[0])[None]
+    q = y[0]
+    columns = y[1:]
+    if not len(columns):
+        return field(s, a, t, q)[None]
     if inputs is None:
-        rate, linear = jax.linearize(lambda q: field(s, a, t, q), y[0])
-        columns = jax.vmap(linear)(y[1:])
+        rate, derivative = jax.linearize(lambda q: field(s, a, t, q), q)
+        column_rates = jax.vmap(derivative)(columns)
     else:
-        at = y[0], jnp.zeros(s.nu)
-        rate, linear = jax.linearize(lambda q, u: s.field(a, t, q, u), *at)
-        columns = jax.vmap(linear)(y[1:], inputs)
-    return jnp.concatenate([rate[None], columns])
+        no_input = jnp.zeros(s.nu)
+        rate, derivative = jax.linearize(lambda q, u: s.field(a, t, q, u), q, no_input)
+        column_rates = jax.vmap(derivative)(columns, inputs)
+    return jnp.concatenate([rate[None], column_rates])
+
+
+# Steps.
 
 
 def unit_step(solver: Solver, rates: Callable, y: Any) -> tuple[Any, Any]:
@@ -86,13 +114,9 @@ def unit_step(solver: Solver, rates: Callable, y: Any) -> tuple[Any, Any]:
 
     term = diffrax.ODETerm(lambda t, y, _: rates(t, y))
     times = jnp.zeros(()), jnp.ones(())
-    begun = solver.init(term, *times, y, None)
-    end, error, _, _, _ = solver.step(term, *times, y, None, begun, False)
+    solver_state = solver.init(term, *times, y, None)
+    end, error, _, _, _ = solver.step(term, *times, y, None, solver_state, False)
     return end, error
-
-
-def is_implicit(solver: Solver) -> bool:
-    return isinstance(solver, Method)
 
 
 def implicit_step(
@@ -107,40 +131,38 @@ def implicit_step(
     """A state and its columns after a step of an implicit method from t to t + h, and the state's
     estimated error.
 
-    Newton's method for the stages of the state comes near their solution. Two steps of it follow
-    for the state and its columns together, with the same matrix: the second one gives them their
-    first derivatives in directions from outside, by the implicit function theorem.
-    """
-    A = np.array(method.a)
-    b = np.array(method.b)
-    c = np.array(method.c)
+    The unknowns are the increments w of all stages. They are found in two parts:
 
-    def lanes(t, q):
+    1. Newton's method for the state alone comes near its increments. It carries no derivatives.
+    2. Two Newton steps for the state and its columns together, with one matrix. The second one
+       gives the increments their first derivatives in directions from outside, by the implicit
+       function theorem.
+    """
+
+    # (`runge_kutta.py` has lanes on the last axis. Here, the only lane is the state.)
+    def field_of_lane(t, q):
         def rate(q):
             return field(s, a, t[0], q)
 
         return jax.vmap(rate, -1, -1)(q)
 
-    def rates_at(t, y):
-        return rates(s, a, t, y.T, inputs).T
-
     state = y[0][:, None]
-    point = (t[None], state, h[None])
-    begin = jax.lax.stop_gradient(point)
-    near, _, J = increments(method, lanes, *begin, small=_NEAR)
-    equations = StageEquations.at(method, lanes, *begin, near)
-    # (From here on, the columns stand where lanes do.)
-    directions = len(y) - 1
-    no_columns = jnp.zeros((*near.shape[:2], directions))
-    w = jnp.concatenate([near, no_columns], axis=2)
-    for _ in range(2):
-        stages = y.T + jnp.tensordot(A, w, 1)
-        along = jax.vmap(rates_at)(t + c * h, stages)
-        change = equations.solve(h * along - w)
-        w = w + change
-    change_of_state = jnp.abs(change[..., :1])
-    left = jnp.max(change_of_state, axis=0)
-    of_state = jax.lax.stop_gradient((w[..., :1], left))
-    _, error = errors(method, *of_state, J, begin[2])
-    end = y + jnp.tensordot(b, w, 1).T
+    begin = jax.lax.stop_gradient((t[None], state, h[None]))
+    near, _, jacobian = increments(method, field_of_lane, *begin, small=_NEAR)
+    equations = StageEquations.at(method, field_of_lane, *begin, near)
+
+    # From here on, the state and its columns take the place of lanes, on the last axis.
+    def rates_of_stage(t, stage):
+        return rates(s, a, t[0], stage.T, inputs).T
+
+    columns = len(y) - 1
+    no_increments = jnp.zeros((*near.shape[:2], columns))
+    w = jnp.concatenate([near, no_increments], axis=2)
+    start = t[None], y.T, h[None]
+    w, change = with_derivatives(method, rates_of_stage, start, equations, w)
+    end = y + jnp.tensordot(np.array(method.b), w, 1).T
+
+    last_change = jnp.max(jnp.abs(change[..., :1]), axis=0)
+    of_state = jax.lax.stop_gradient((w[..., :1], last_change))
+    _, error = errors(method, *of_state, jacobian, begin[2])
     return end, error[:, 0]

@@ -1,4 +1,9 @@
-"""The rows of an itinerary as its program reads them."""
+"""The rows of an itinerary as its program reads them.
+
+`tabulated` replaces the number of a row's body by the numbers that the program chooses by (chart,
+kind of jump, and so on). A `Table` has all of them in two arrays, because the program reads a line
+of an array at once: a line of `numbers` is the first fields of `Row`, in order, then the signs.
+"""
 
 from typing import NamedTuple
 
@@ -13,7 +18,8 @@ from .rows import JUMP, STEP, Body, Form, Rows
 
 
 class Row(NamedTuple):
-    """One row for the program: its columns (see `Rows`), and numbers by its body."""
+    """One row for the program: its columns (see `Rows`), and numbers by its body. (The order of the
+    fields is that of `Table.numbers`.)"""
 
     leg: Int[Array, ""]
     target: Int[Array, ""]
@@ -37,10 +43,9 @@ class Row(NamedTuple):
 
 
 class Table(NamedTuple):
-    """R rows in few arrays: the program reads each at once."""
+    """R rows."""
 
     numbers: Int[Array, "R K"]
-    """The first fields of `Row`, in order, then the signs."""
     fraction: Float[Array, " R"]
 
     def row(self, k: Int[Array, ""]) -> Row:
@@ -49,8 +54,8 @@ class Table(NamedTuple):
 
 def read(one: Table) -> Row:
     """The row in one line of a table."""
-    *fields, _, _ = Row._fields
-    values = {x: one.numbers[i] for i, x in enumerate(fields)}
+    fields = Row._fields[:-2]
+    values = {name: one.numbers[i] for i, name in enumerate(fields)}
     for name in ("onward", "ends_leg", "is_jump", "at_once", "scheduled"):
         values[name] = values[name] > 0
     return Row(**values, fraction=one.fraction, signs=one.numbers[len(fields) :])
@@ -58,9 +63,11 @@ def read(one: Table) -> Row:
 
 def tabulated(s: Structure, form: Form, rows: Rows) -> Table:
     """The rows of an itinerary for its program."""
-    ways, kinds = form.ways, form.kinds
+    ways = form.ways
+    kinds = form.kinds
     chart = {a: k for k, a in enumerate(form.charts)}
 
+    # (In the order of the fields of `Row`.)
     def of_body(body: Body) -> tuple[int, ...]:
         is_jump = body.does == JUMP
         scheduled = is_jump and isinstance(
@@ -77,8 +84,8 @@ def tabulated(s: Structure, form: Form, rows: Rows) -> Table:
         )
 
     by_body = jnp.asarray(np.array([of_body(x) for x in form.bodies], np.int32))
-    own = rows.leg, rows.target, rows.place, rows.piece, rows.onward, rows.section
-    columns = jnp.stack([jnp.asarray(x, jnp.int32) for x in own], axis=1)
+    of_row = rows.leg, rows.target, rows.place, rows.piece, rows.onward, rows.section
+    columns = jnp.stack([jnp.asarray(x, jnp.int32) for x in of_row], axis=1)
     signs = jnp.asarray(rows.signs, jnp.int32)
     numbers = [columns, by_body[jnp.asarray(rows.body)], signs]
     return Table(jnp.concatenate(numbers, axis=1), jnp.asarray(rows.fraction))

@@ -1,8 +1,16 @@
 """A trajectory that follows an itinerary.
 
 `follow` loops over the rows of a table, and each row does what `bodies.py` has for its kind. With
-`columns`, derivatives are carried along. Whether the itinerary was kept is decided by `flags.py`,
-and reported as `left`. A wrong state comes from `bodies.py` or `steps.py`; a trajectory that leaves
+`columns`, derivatives are carried along. What the loop changes is
+
+| | |
+|---|---|
+| `_State.course` | where the trajectory is now |
+| `_State.begun` | where its pieces have begun: what the `Passage` returns of them |
+| `Flags` | whether the itinerary was kept: reported as `left` |
+
+`_Steps` has the loop: `loop` over a count of rows, or `scan`, which reverse mode can differentiate,
+over all of them. A wrong state comes from `bodies.py` or `steps.py`; a trajectory that leaves
 without need, from `flags.py`.
 """
 
@@ -16,12 +24,14 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._core.loops import loop, pushed
 from ..settings import Settings
 from ..target import AbstractLevels
-from .bodies import Bodies, Constants, Course, Travelers
-from .flags import Entry, Flags, Watched
-from .motion import Alone, InDirections
+from .bodies import Bodies
+from .course import Constants, Course, Travelers
+from .flags import Flags, entry_at_departure
+from .motion import Alone, InDirections, still
 from .rows import Form, Rows
 from .steps import Solver, solver_of
-from .table import Row, read, tabulated
+from .table import Row, Table, read, tabulated
+from .watched import Watched
 
 
 class Passage(NamedTuple):
@@ -88,17 +98,8 @@ def follow(
     table = tabulated(travelers.structure, form, rows)
     numbers = travelers.numbers
     constants = Constants(numbers, levels, settings, table, count, begin, known)
-    state, flags = steps.depart(constants, ends)
-    if count is not None:
-        every = passes * count
-        state, flags = loop(
-            steps.take, steps.take_along, constants, state, flags, every
-        )
-    else:
-        one = lambda both, row: (steps.row(constants, read(row), *both), None)  # noqa: E731
-        for _ in range(passes):
-            both = steps.depart(constants, state.course.ends)
-            state, flags = jax.lax.scan(one, both, table)[0]
+    rows_done = steps.scan if count is None else steps.loop
+    state, flags = rows_done(constants, ends)
     return _passage(state, flags, form, columns, travelers.many)
 
 
@@ -123,7 +124,7 @@ class _Steps:
     def depart(self, constants: Constants, ends) -> "tuple[_State, Flags]":
         """The beginning, with guessed ends of legs."""
         known = constants.known
-        ends = jax.lax.stop_gradient(ends)
+        ends = still(ends)
         if known is not None:
             ends = jnp.where(jnp.isfinite(known), known, ends)
 
@@ -131,11 +132,26 @@ class _Steps:
             return _departed(t, q, ends, self.columns, self.form)
 
         course, flags = self.travelers.each(of_lane)(*constants.begin, ends)
-        # (Rows at which no piece begins write into one more place.)
-        kept = lambda x: jnp.zeros((self.form.pieces + 1, *x.shape))  # noqa: E731
-        at_begin = (course.t, course.y, course.delay, course.rate)
-        begun = _Begun(*map(kept, at_begin))
-        return _State(course, begun), flags
+        return _State(course, _Begun.none(self.form.pieces, course)), flags
+
+    def loop(self, constants: Constants, ends) -> "tuple[_State, Flags]":
+        """The rows that do something, which carry their derivatives along."""
+        assert constants.count is not None
+        state, flags = self.depart(constants, ends)
+        every = self.passes * constants.count
+        return loop(self.take, self.take_along, constants, state, flags, every)
+
+    def scan(self, constants: Constants, ends) -> "tuple[_State, Flags]":
+        """All rows, in a loop that reverse mode can differentiate."""
+
+        def take(carry: tuple[_State, Flags], line: Table):
+            return self.row(constants, read(line), *carry), None
+
+        for _ in range(self.passes):
+            carry = self.depart(constants, ends)
+            (state, flags), _ = jax.lax.scan(take, carry, constants.rows)
+            ends = state.course.ends
+        return state, flags
 
     def take(self, constants: Constants, k, state: "_State", flags: Flags):
         """Step k, which may be the first of another pass."""
@@ -160,7 +176,8 @@ class _Steps:
         by_ended = columns.begun.ended(row, columns.course, 1)
         both = state.course, columns.course
         (course, by_course), flags = self._bodies.take(motion, row, both, flags)
-        begun, by_begun = ended.begun(row, course), by_ended.begun(row, by_course, 1)
+        begun = ended.begun(row, course)
+        by_begun = by_ended.begun(row, by_course, 1)
         return _State(course, begun), _State(by_course, by_begun), flags
 
     def row(self, constants: Constants, row: Row, state: "_State", flags: Flags):
@@ -217,12 +234,16 @@ def _departed(
         slope=jnp.ones(()),
         h=jnp.zeros(()),
     )
-    t = jax.lax.stop_gradient(t)
+    t = still(t)
     zero = jnp.zeros_like(t)
-    before = Watched.unknown(t, form.watched, jax.lax.stop_gradient(q))
-    entry = Entry.departure(form.watched)
-    left = jnp.asarray(False)
-    return course, Flags(before, entry, error=zero, last=zero, left=left)
+    flags = Flags(
+        before=Watched.unknown(t, form.watched, still(q)),
+        entry=entry_at_departure(form.watched),
+        error=zero,
+        last=zero,
+        left=jnp.asarray(False),
+    )
+    return course, flags
 
 
 class _State(NamedTuple):
@@ -235,8 +256,10 @@ class _State(NamedTuple):
 def _passage(
     state: _State, flags: Flags, form: Form, columns: bool, many: bool
 ) -> Passage:
-    """What has been passed at the end."""
-    (course, begun), K = state, form.pieces
+    """The result, at the end."""
+    course = state.course
+    begun = state.begun
+    K = form.pieces
     # (Columns begin anew with each piece: those before are the factors.)
     ends = jnp.concatenate([begun.y[1:K], course.y[None]])
     factors = ends[..., 1:, :]
@@ -244,30 +267,51 @@ def _passage(
         delays = jnp.concatenate([begun.delay[1:K], course.delay[None]])
         of_time = delays[..., None]
         factors = jnp.concatenate([of_time, factors], axis=-1)
-    last = lambda x: jnp.moveaxis(x, 0, 1) if many else x  # noqa: E731
+
+    def lanes_first(x):
+        return jnp.moveaxis(x, 0, 1) if many else x
+
     return Passage(
-        course.t,
-        course.y[..., 0, :],
-        course.ends,
-        last(begun.t[:K]),
-        last(begun.y[:K, ..., 0, :]),
-        last(begun.rate[:K]),
-        jnp.swapaxes(last(factors), -1, -2),
-        course.delay,
-        flags.error,
-        flags.last,
-        flags.left,
+        t=course.t,
+        q=course.y[..., 0, :],
+        ends=course.ends,
+        pieces_t=lanes_first(begun.t[:K]),
+        pieces_q=lanes_first(begun.y[:K, ..., 0, :]),
+        rates=lanes_first(begun.rate[:K]),
+        factors=jnp.swapaxes(lanes_first(factors), -1, -2),
+        delay=course.delay,
+        error=flags.error,
+        last=flags.last,
+        left=flags.left,
     )
 
 
 class _Begun(NamedTuple):
-    """Where pieces begin: the time, the state with the columns of the piece before, the columns of
-    the time, and the field. Derivatives have directions on the first axis."""
+    """Where pieces begin. The first axis of arrays is the piece; in derivatives it is the second,
+    behind directions. Rows at which no piece begins write into one more place, after all pieces."""
 
     t: Array
+    """Times."""
     y: Array
+    """States, with the columns at the end of the piece before."""
     delay: Array
+    """Columns of the time, at the end of the piece before."""
     rate: Array
+    """The field."""
+
+    @classmethod
+    def none(cls, pieces: int, course: Course) -> "_Begun":
+        """No piece has begun."""
+
+        def places(x):
+            return jnp.zeros((pieces + 1, *x.shape))
+
+        return cls(
+            t=places(course.t),
+            y=places(course.y),
+            delay=places(course.delay),
+            rate=places(course.rate),
+        )
 
     def ended(self, row: Row, course: Course, axis: int = 0) -> "_Begun":
         """With the end of the piece before a row."""
