@@ -270,7 +270,7 @@ def flow(
     - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
       that ended there. A `Guess` with states (L, n) starts L flows. A state (n,), in order or by
       name, stands for a `Guess` where only one chart has such states, and a `LimitCycle` for its
-      state at `anchor`.
+      state at `anchor`. `cycle.state` and the states of an event know their chart and time.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
     - `within`: the longest duration, required for all ends other than a time. Do not make it much
