@@ -375,7 +375,8 @@ class Responses(Showable, eqx.Module):
             if self.of_phase is None:
                 raise DefinitionError(
                     f"{type(self.structure.system).__name__} has no phase response: its phase is "
-                    "that of its clock; use `amplitude`."
+                    "that of its clock; `responses.amplitude(0, phase)` is the response of its "
+                    "first mode."
                 )
             return self.of_phase
         require_index("mode with an amplitude", mode, len(self.exponents))

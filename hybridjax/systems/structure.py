@@ -162,7 +162,7 @@ class ByName(dict):
         """Return the same with other numbers."""
         return ByName(items, self._chart, self._time)
 
-    def __or__(self, items: Mapping[str, Any]) -> "ByName":
+    def __or__(self, items: Mapping[str, Any]) -> "ByName":  # type: ignore[override]
         return self.with_items({**self, **items})
 
     def as_guess(self) -> Guess | None:

@@ -26,6 +26,7 @@ def positional(function):
 
 def scale(t):
     yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, guess=t.cycle)
+    yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, mu=[0.1, 0.2])
     yield hj.scale.monte_carlo, dict(function=lambda rng: "no number", draws=3)
     yield hj.scale.SweepPoints, dict(values={"x": [1.0]})
     yield hj.scale.SweepPoints.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
@@ -78,6 +79,7 @@ def systems(t):
             max_events=2,
         ),
     )
+    yield hj.flow(t.system, guess, 0.1).__getitem__, dict(name="x")
     samples = dict(
         times=(0.1, 0.2),
         outputs="x",
@@ -124,6 +126,7 @@ def cycles(t):
             step=0.05,
         ),
     )
+    yield hj.continuation, dict(cycle=t.cycle, mu=(0.1, 0.2), step=0.05)
     yield t.cycle.responses, dict(modes=0)
     yield (
         t.cycle.asymptotic_phase,
