@@ -362,6 +362,22 @@ def test_a_state_of_a_cycle_begins_at_its_time(hopper, cycle):
         assert hj.simulate(hopper, state, 0.1).t[0] == t
 
 
+def test_a_state_of_a_cycle_has_derivatives(hopper, cycle):
+    (t,) = cycle.anchor.t
+
+    def height(v, start):
+        return hj.flow(hopper, start(v), t + 0.5)["yM"]
+
+    state = cycle.state
+    short = jax.grad(height)(state["vM"], lambda v: state | {"vM": v})
+    guess = jax.grad(height)(
+        state["vM"], lambda v: hj.Guess("stance", (state["yM"], v), t)
+    )
+    assert short == guess != 0
+    whole = jax.grad(lambda x: hj.flow(hopper, x, t + 0.5)["yM"])(state)
+    assert whole["vM"] == guess
+
+
 def test_a_state_of_a_cycle_knows_its_chart():
     def decay(t, q, u):
         return (jnp.cos(2 * jnp.pi * t) - q[0],)

@@ -146,8 +146,9 @@ def _index(what: str, name: str, names: Sequence[str]) -> int:
     return names.index(name)
 
 
+@jax.tree_util.register_pytree_node_class
 class ByName(dict):
-    """Numbers by names. An error for another name lists them.
+    """Numbers by names. An error for another name lists them. A pytree, as dictionaries are.
 
     **Arguments:** `chart`, `time`: where and when the numbers are a state. (Else who starts there
     would start at time 0, and leave the cycle of a system with a clock.)
@@ -157,6 +158,15 @@ class ByName(dict):
         super().__init__(values)
         self._chart = chart
         self._time = time
+
+    def tree_flatten(self):
+        return (tuple(self.values()), self._time), (tuple(self), self._chart)
+
+    @classmethod
+    def tree_unflatten(cls, about, children):
+        names, chart = about
+        values, time = children
+        return cls(zip(names, values, strict=True), chart, time)
 
     def with_items(self, items: Mapping[str, Any]) -> "ByName":
         """Return the same with other numbers."""
