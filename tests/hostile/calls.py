@@ -26,7 +26,6 @@ def positional(function):
 
 def scale(t):
     yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, guess=t.cycle)
-    yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, mu=[0.1, 0.2])
     yield hj.scale.monte_carlo, dict(function=lambda rng: "no number", draws=3)
     yield hj.scale.SweepPoints, dict(values={"x": [1.0]})
     yield hj.scale.SweepPoints.sobol, dict(ranges={"x": (0.0, 1.0)}, count=4)
@@ -79,7 +78,6 @@ def systems(t):
             max_events=2,
         ),
     )
-    yield hj.flow(t.system, guess, 0.1).__getitem__, dict(name="x")
     samples = dict(
         times=(0.1, 0.2),
         outputs="x",
@@ -126,7 +124,6 @@ def cycles(t):
             step=0.05,
         ),
     )
-    yield hj.continuation, dict(cycle=t.cycle, mu=(0.1, 0.2), step=0.05)
     yield t.cycle.responses, dict(modes=0)
     yield (
         t.cycle.asymptotic_phase,
@@ -564,6 +561,14 @@ def without_arguments(t):
         yield call, {}
 
 
+def short_forms(t):
+    """Parameters as keywords, and states by name."""
+    yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, mu=[0.1, 0.2])
+    yield hj.continuation, dict(cycle=t.cycle, mu=(0.1, 0.2), step=0.05)
+    start = hj.Guess("plane", (1.0, 0.0))
+    yield hj.flow(t.system, start, 0.1).__getitem__, dict(name="x")
+
+
 PARTS = (
     without_arguments,
     scale,
@@ -586,4 +591,5 @@ PARTS = (
     conversions,
     plots,
     rhythms,
+    short_forms,
 )
