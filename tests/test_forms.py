@@ -1,9 +1,12 @@
 """Short forms of arguments: what they return is that of the long ones."""
 
+import copy
 import functools
 import pathlib
+import pickle
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -338,3 +341,49 @@ def test_a_field_that_is_no_parameter_says_how_to_make_it_one():
 
     with pytest.raises(DefinitionError, match="`gain: hj.Parameter"):
         hj.sweep(Plain(), gain=[1.0, 2.0])
+
+
+def test_a_state_of_a_cycle_begins_at_its_time(hopper, cycle):
+    """A hopper has a clock: from the same state at time 0 it would leave the cycle."""
+    (t,) = cycle.anchor.t
+    assert t > 0
+    path = hj.simulate(hopper, cycle.state, 3.0)
+    assert path.t[0] == t
+    np.testing.assert_allclose(path.after[-1], path.after[0], atol=1e-10)
+    at_end = hj.flow(hopper, cycle.state, t + 3.0)
+    assert at_end["yM"] == pytest.approx(cycle.state["yM"], abs=1e-10)
+    assert hj.simulate(hopper, cycle.state, 0.1, time=0.2).t[0] == 0.2
+    pushed = hj.simulate(hopper, cycle.state | {"vM": 2.0}, 0.1)
+    assert (pushed.t[0], pushed.after[0, 1]) == (t, 2.0)
+    event = path.events[0]
+    assert hj.simulate(hopper, event.after, 0.1).t[0] == event.time
+    same = copy.copy(cycle.state), pickle.loads(pickle.dumps(cycle.state))
+    for state in same:
+        assert hj.simulate(hopper, state, 0.1).t[0] == t
+
+
+def test_a_state_of_a_cycle_has_derivatives(hopper, cycle):
+    (t,) = cycle.anchor.t
+
+    def height(v, start):
+        return hj.flow(hopper, start(v), t + 0.5)["yM"]
+
+    state = cycle.state
+    short = jax.grad(height)(state["vM"], lambda v: state | {"vM": v})
+    guess = jax.grad(height)(
+        state["vM"], lambda v: hj.Guess("stance", (state["yM"], v), t)
+    )
+    assert short == guess != 0
+    whole = jax.grad(lambda x: hj.flow(hopper, x, t + 0.5)["yM"])(state)
+    assert whole["vM"] == guess
+
+
+def test_a_state_of_a_cycle_knows_its_chart():
+    def decay(t, q, u):
+        return (jnp.cos(2 * jnp.pi * t) - q[0],)
+
+    charts = {name: Field(("x",), decay) for name in ("left", "right")}
+    system = toy(charts, period=1.0)
+    cycle = hj.find_limit_cycle(system, hj.Guess("right", (0.1,)))
+    path = hj.simulate(system, cycle.state, 1.0)
+    assert path.structure.names[path.chart[0]] == "right"

@@ -360,7 +360,7 @@ hj.identify_recording(rec, ("vM", "falling"), "u", "yM") -> hj.Crossing(
 hj.linearize(cycle, ("yM", "falling"))                  -> hj.Crossing('yM', 'falling')
 hj.plot.cycle(cycle, ("yM", "vM"))                      -> hj.plot.cycle(cycle, x, y)
 hj.recordings.Population([fit, fit])                    -> Population.from_fits
-hj.fit_model(hopper, result, "k")                       -> ObservedSeries(result.data
+hj.fit_model(hopper, result, "k")                       -> ObservedTrajectory(hj.Guess(
 hj.sweep(hopper, stiffness=[9.0, 10.0])                 -> k=values
 hj.sweep(hopper)                                        -> hj.sweep(system, m=[0.1, 0.5])
 hj.sweep(hopper, {"k": [9.0]}, k=[9.0])                 -> given twice
@@ -386,6 +386,29 @@ setattr(hopper, "stiffness", 9.0)                       -> use `k`
 setattr(cycle, "period", 9.0)                           -> hj.find_limit_cycle(system)
 setattr(fit, "covariance", 0)                           -> hj.fit_multipliers(htf, order)
 setattr(data, "u", 0)                                   -> hj.run_experiments
+cycle.state(0.5)                                        -> charts, states = trajectory.at(times)
+cycle.monodromy                                         -> hj.linearize(cycle, sections).monodromy()
+cycle.poincare_map                                      -> hj.sections.section_map
+cycle.responses().plot()                                -> responses.amplitude(0, phase)
+hj.simulate(hopper, "stance", cycle.state, 1.0)         -> hj.simulate(system, state, duration)
+hj.System(lambda t, x: x)                               -> (t, q, u, p)
+hj.HybridSystem(modes={}, guards={}, resets={})         -> [(name, guard, reset)]
+hj.HybridSystem.from_sympy("x")                         -> hj.HybridSystem.from_functions
+hj.models.RelayFeedback()                               -> hj.HybridSystem.from_functions
+model.discretize()                                      -> model.A[k]
+est["yM"]                                               -> htf.H[:, :, htf.outputs.index('y')]
+est.select("yM")                                        -> htf.plot(outputs='y')
+design.n_realizations                                   -> of all realizations together
+ser.residuals                                           -> validation.measured
+hj.fit_series(data, order=(1, 2, 3))                    -> hj.select_order(data)
+hj.fit_multipliers(est, range(1, 4))                    -> hj.select_order(htf)
+hj.fit_model(hopper, rec, {"k": 20.0})                  -> ObservedTrajectory(hj.Guess(
+hj.fit_model(hopper, hj.fitting.ObservedHTF(est, sections), {"k": 20.0}) -> (5.0, 20.0)
+hj.Recording.from_csv("trial.csv")                      -> hj.read_recording(path)
+hj.Recording.from_dataframe(rec.to_pandas())            -> hj.Recording(table)
+hj.Recording.sfreq                                      -> `rate`
+hj.read_recording("trial.csv", inputs="u")              -> `signals` chooses columns
+hj.compare_groups([result], [result])                   -> 'group': groups}
 """
 
 
@@ -673,6 +696,22 @@ def test_settings_print_their_accuracy():
 
 
 FITS = "fit", "ser", "ldtp", "phys"
+
+
+def test_what_leads_name_runs(names):
+    """The calls of sentences that other tests hold only by their words."""
+    ser, data, est = names["ser"], names["data"], names["est"]
+    validation = hj.validate(ser, data)
+    residuals = validation.measured - validation.simulated
+    assert 0 < np.abs(residuals).max() < np.abs(data.y).max()
+    of_output = est.H[:, :, est.outputs.index("yM")]
+    assert_array_equal(of_output, np.asarray(est.H)[:, :, 0])
+    assert est.plot(outputs="yM").axes.size
+    groups = {"subject": list("abcd"), "group": list("xxyy")}
+    people = hj.recordings.Population.from_fits([names["result"]] * 4, groups)
+    assert people.difference("modulus", "x", "y")["p"].item() > 0.9
+    responses = names["cycle"].responses()
+    assert responses.amplitude(0, [0.1, 0.2])["u"].shape == (2,)
 
 
 @pytest.mark.parametrize("name", FITS)

@@ -123,12 +123,13 @@ class Trajectory(Showable, eqx.Module):
         for k in np.flatnonzero(self.event >= 0):
             tr = s.transitions[self.event[k]]
             source = s.chart_index(tr.source)
-            before = s.by_name(source, self.before[k])
+            time = float(self.t[k])
+            before = s.by_name(source, self.before[k], time)
             target = s.chart_index(tr.target)
-            after = s.by_name(target, self.after[k])
+            after = s.by_name(target, self.after[k], time)
             events.append(
                 Event(
-                    time=float(self.t[k]),
+                    time=time,
                     name=tr.name,
                     source=tr.source,
                     target=tr.target,
@@ -322,7 +323,8 @@ def simulate(
         that starts below the floor falls on. `findings` of the trajectory list such guards. A start
         at the time of a scheduled event lies after its reset. A `Guess` can replace all three:
         `hj.simulate(system, guess, duration)`. If only one chart has such states, a state suffices:
-        `(1.0, 0.0)` or `{"y": 1.0, "v": 0.0}`. Default: the model's own guess.
+        `(1.0, 0.0)` or `{"y": 1.0, "v": 0.0}`. `cycle.state` and the states of an event know
+        their chart and time. Default: the model's own guess.
     - `duration`: length in the system's unit of time.
     - `input`: a constant input (nu,), or a function of time that returns one. Default: 0.
     - `settings`: accuracy of the flow. Without a `scale`, errors are relative to the magnitude of
@@ -445,7 +447,7 @@ def _start_of(
             "`hj.simulate(system, guess, duration)`."
         )
     if not isinstance(start, Guess):
-        return guess_of(s, start, "the state", 0.0 if time is None else time), length
+        return guess_of(s, start, "the state", time), length
     if time is not None:
         raise DefinitionError(
             "simulate: a guess has its own time: `hj.Guess(chart, state, time)`, without `time`."

@@ -292,11 +292,12 @@ class LimitCycle(WithMultipliers, eqx.Module):
 
     @property
     def state(self) -> dict[str, float]:
-        """The state at `anchor`, by name."""
+        """The state at `anchor`, by name. A simulation or a flow that starts with it begins at the
+        time of `anchor`, and stays on the cycle."""
         _require_values(self, "state")
         anchor = to_host(self.anchor)
         chart = int(anchor.chart[0])
-        return self.structure.by_name(chart, anchor.q[:, 0])
+        return self.structure.by_name(chart, anchor.q[:, 0], float(anchor.t[0]))
 
     def trajectory(self, periods: Positive = 1.0) -> Trajectory:
         """The orbit from `anchor` on, with its events, dense enough to plot.

@@ -239,7 +239,8 @@ def flow(
       a single chart without events.
     - `start`: a `Guess` with the chart, the state (n,) and the time (Default: 0), or the `Flow`
       that ended there. A `Guess` with states (L, n) starts L flows. If only one chart has such
-      states, a state (n,) suffices, as numbers or by name. A `LimitCycle` starts at its `anchor`.
+      states, a state (n,) suffices, as numbers or by name. `cycle.state` and the states of an event
+      know their chart and time. A `LimitCycle` starts at its `anchor`.
     - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
     - `within`: the longest duration, required for all ends other than a time. Do not make it much

@@ -377,7 +377,8 @@ class Responses(Showable, eqx.Module):
             if self.of_phase is None:
                 raise DefinitionError(
                     f"{name_of(self.structure.system)} has no phase response: its phase is "
-                    "that of its clock; use `amplitude`."
+                    "that of its clock; `responses.amplitude(0, phase)` is the response of its "
+                    "first mode."
                 )
             return self.of_phase
         require_index("mode with an amplitude", mode, len(self.exponents))

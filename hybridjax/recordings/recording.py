@@ -20,7 +20,7 @@ from scipy.optimize.elementwise import find_root
 from .._core import limits
 from .._core.arguments import require_among, require_equal
 from .._core.boundary.checked import checked
-from .._core.boundary.members import leading_on
+from .._core.boundary.members import Leading, leading_on
 from .._core.boundary.values import Plain
 from .._core.findings import Finding, print_findings
 from .._core.showable import Showable
@@ -85,7 +85,7 @@ class Trial(eqx.Module):
 
 
 @checked
-class Recording(Showable, eqx.Module):
+class Recording(Showable, eqx.Module, metaclass=Leading):
     """Sampled signals of one or several trials. Nothing is resampled.
 
     **Fields:**

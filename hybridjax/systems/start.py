@@ -9,7 +9,7 @@ import numpy as np
 from .._core.boundary.kinds import Numbers, Scalar
 from .._core.boundary.values import Plain, Reals
 from ..errors import DefinitionError
-from .structure import Structure
+from .structure import ByName, Structure
 from .system import Guess, HybridSystem, name_of, taken_by_position
 
 
@@ -70,14 +70,24 @@ def _require_arguments(field: Callable, made: str) -> None:
         )
 
 
-def guess_of(s: Structure, state: StateLike, called: str, time: Any = 0.0) -> Guess:
-    """Return the guess that a state means: in the only chart whose states these are.
+def guess_of(
+    s: Structure, state: StateLike, called: str, time: Any | None = None
+) -> Guess:
+    """Return the guess that a state means: in the only chart whose states these are; of a state
+    that knows its chart and its time, there and then.
 
-    **Arguments:** `called`: how sentences begin, as "`start`".
+    **Arguments:** `called`: how sentences begin, as "`start`". `time`: Default: that of the state,
+    or 0.
 
     **Raises:** `DefinitionError` if the states fit no chart, or several.
     """
     fitting = [a for a in range(len(s.charts)) if _fits(s, a, state)]
+    known = state.as_guess() if isinstance(state, ByName) else None
+    if known is not None:
+        time = known.time if time is None else time
+        # (A system with other charts may have such states, too.)
+        fitting = [a for a in fitting if s.names[a] == known.chart] or fitting
+    time = 0.0 if time is None else time
     if len(fitting) == 1:
         (a,) = fitting
         values: Any = state

@@ -15,7 +15,7 @@ import dataclasses
 import functools as ft
 import itertools
 import operator
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,7 +37,7 @@ from .._core.signal import Signal, signals, unit_of
 from ..errors import DefinitionError
 from .chart import Chart
 from .solver import ByChart, Method, as_method
-from .system import Driven, HybridSystem, Output, name_of
+from .system import Driven, Guess, HybridSystem, Output, name_of
 from .transition import Scheduled, Transition
 from .verner import VERNER76
 
@@ -146,13 +146,54 @@ def _index(what: str, name: str, names: Sequence[str]) -> int:
     return names.index(name)
 
 
+@jax.tree_util.register_pytree_node_class
 class ByName(dict):
-    """Numbers by names. An error for another name lists them."""
+    """Numbers by names. An error for another name lists them. A pytree, as dictionaries are.
+
+    **Arguments:** `chart`, `time`: where and when the numbers are a state. (Else who starts there
+    would start at time 0, and leave the cycle of a system with a clock.)
+    """
+
+    def __init__(self, values: Any, chart: str | None = None, time: Any = None):
+        super().__init__(values)
+        self._chart = chart
+        self._time = time
+
+    def tree_flatten(self):
+        return (tuple(self.values()), self._time), (tuple(self), self._chart)
+
+    @classmethod
+    def tree_unflatten(cls, about, children):
+        names, chart = about
+        values, time = children
+        return cls(zip(names, values, strict=True), chart, time)
+
+    def with_items(self, items: Mapping[str, Any]) -> "ByName":
+        """Return the same with other numbers."""
+        return ByName(items, self._chart, self._time)
+
+    def __or__(self, items: Mapping[str, Any]) -> "ByName":  # type: ignore[override]
+        return self.with_items({**self, **items})
+
+    def as_guess(self) -> Guess | None:
+        """Return the state as a start, or `None` where its chart or time is not known."""
+        if self._chart is None or self._time is None:
+            return None
+        return Guess(self._chart, tuple(self.values()), self._time)
+
+    def __call__(self, *_: Any, **__: Any):
+        raise TypeError(
+            "this is the state at one time: `charts, states = trajectory.at(times)` has those at "
+            "others, of `cycle.trajectory()` or of `hj.simulate`."
+        )
 
     def __missing__(self, name: str):
         raise KeyError(f"there is no '{name}'; names are {', '.join(self)}")
 
     def __getattr__(self, name: str):
+        if name.startswith("_"):
+            # (`copy` and `pickle` ask for such names before there are numbers.)
+            raise AttributeError(f"'ByName' object has no attribute {name!r}")
         if name in self:
             raise AttributeError(f"names stand in brackets here: write `['{name}']`.")
         raise AttributeError(
@@ -572,9 +613,10 @@ class Structure:
         rows = zip(self.names, np.asarray(scale), self.dims, strict=True)
         return {name: row[:d] for name, row, d in rows}
 
-    def by_name(self, a: int, q: np.ndarray) -> dict[str, float]:
-        """A state of chart a by names."""
-        return ByName(zip(self.charts[a].states, q.tolist(), strict=False))
+    def by_name(self, a: int, q: np.ndarray, time: Any = None) -> dict[str, float]:
+        """A state of chart a by names, at a time."""
+        values = zip(self.charts[a].states, q.tolist(), strict=False)
+        return ByName(values, self.names[a], time)
 
     def drawing(self, a: int, t: Any, q: Any) -> Any:
         """The drawing of a state of chart a, or `None`."""

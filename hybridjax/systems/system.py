@@ -31,7 +31,12 @@ from .._core.boundary.kinds import (
     PositiveScalar,
     Scalar,
 )
-from .._core.boundary.members import Bound, fixed_attribute, missing_attribute
+from .._core.boundary.members import (
+    Bound,
+    Leading,
+    fixed_attribute,
+    missing_attribute,
+)
 from .._core.boundary.values import Reals
 from .._core.executor import Definition, is_tracer
 from .._core.meaning import Part, current, meaning, parts_by_name, parts_of
@@ -282,7 +287,7 @@ class _DefaultInputs:
         return (SECOND_NAME if DEFAULT_INPUT in taken else DEFAULT_INPUT,)
 
 
-class HybridSystem(Definition):
+class HybridSystem(Definition, metaclass=Leading):
     """A rhythmic hybrid system (paper Sec. II). Subclass it; its fields are the parameters.
 
     **Example:**
@@ -338,13 +343,13 @@ class HybridSystem(Definition):
                 )
 
     def __new__(cls, *args, **kwargs):
-        check_fields(cls, args, kwargs)
         if cls.__abstractmethods__:
             raise DefinitionError(
                 f"{cls.__name__} is a base class without `charts`: `hj.models` has systems, and "
-                "`hj.HybridSystem.from_functions(states, field, events)` or a class with `def "
-                "charts(self)` makes one."
+                "`hj.HybridSystem.from_functions(states, field, [(name, guard, reset)])` or a "
+                "class with `def charts(self)` makes one."
             )
+        check_fields(cls, args, kwargs)
         return super().__new__(cls)
 
     @abc.abstractmethod

@@ -561,6 +561,14 @@ def without_arguments(t):
         yield call, {}
 
 
+def short_forms(t):
+    """Parameters as keywords, and states by name."""
+    yield hj.sweep, dict(model=t.system, values={"nope": [1.0]}, mu=[0.1, 0.2])
+    yield hj.continuation, dict(cycle=t.cycle, mu=(0.1, 0.2), step=0.05)
+    start = hj.Guess("plane", (1.0, 0.0))
+    yield hj.flow(t.system, start, 0.1).__getitem__, dict(name="x")
+
+
 PARTS = (
     without_arguments,
     scale,
@@ -583,4 +591,5 @@ PARTS = (
     conversions,
     plots,
     rhythms,
+    short_forms,
 )

@@ -248,7 +248,7 @@ def main() -> None:
         for function, good in itertools.chain(*(part(things) for part in PARTS)):
             name = name_of(function)
             wrong.setdefault(name, [])
-            for argument in named_arguments(function):
+            for argument in named_arguments(function, good):
                 values = VALUES if options.all else VALUES[turn % 16 :: 16]
                 for shown in refusals_that_are_wrong(function, good, argument, values):
                     wrong[name].append(shown)
@@ -260,17 +260,23 @@ def main() -> None:
     print(json.dumps({"calls": wrong, "files": left}, indent=1))
 
 
-def named_arguments(function) -> list[str]:
+def named_arguments(function, good: dict) -> list[str]:
+    """The arguments of a function, with the parameters of a system that a good call has among its
+    keywords."""
     names = []
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             names.append(name)
+        elif name == "parameters":
+            names += [x for x in good if x not in names]
     return names
 
 
 def refusals_that_are_wrong(function, good, argument, values):
     """Iterate over what is wrong with the refusals of some values of an argument."""
     kind = kinds_of(function).get(argument)
+    if argument not in inspect.signature(function).parameters:
+        kind = function.kinds.of_parameters
     is_slow = name_of(function) in SLOW
     for value in values:
         is_traced = value is TRACED

@@ -154,7 +154,9 @@ class Table(Kind):
         for name, item in value.items():
             name = name if self.key is None else _taken(self.key, name, name)
             out[name] = item if self.value is None else _taken(self.value, name, item)
-        return out
+        # (A state of a cycle knows more than its numbers.)
+        with_items = getattr(type(value), "with_items", None)
+        return out if with_items is None else with_items(value, out)
 
 
 class Names(Kind):

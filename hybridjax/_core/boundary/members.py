@@ -36,6 +36,18 @@ def missing_attribute(self: Any, name: str) -> Any:
     raise UnknownAttribute(about)
 
 
+class Leading(type(eqx.Module)):  # type: ignore[misc]  # (It has no public name.)
+    """The class of classes whose missing constructors lead on, such as `Recording.from_csv`."""
+
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("_") or name in leads.attributes_of(cls):
+            # (Fields are attributes of objects, and not of their class.)
+            raise AttributeError(
+                f"type object {cls.__name__!r} has no attribute {name!r}"
+            )
+        raise UnknownAttribute(functools.partial(leads.about_attribute, cls, name))
+
+
 def leading_on(cls: Class) -> Class:
     """A class whose missing attributes lead on: a small part of a result."""
     setattr(cls, "__getattr__", missing_attribute)  # noqa: B010

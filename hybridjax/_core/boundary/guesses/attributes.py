@@ -3,7 +3,14 @@
 Tables for `leads.py`.
 """
 
-from .sentences import COMPARE, CONTROL, DECAY, EXPONENT
+from .sentences import (
+    COMPARE,
+    CONTROL,
+    DECAY,
+    EXPONENT,
+    MADE_OF_FUNCTIONS,
+    RESIDUALS,
+)
 
 
 ATTRIBUTES = {
@@ -45,7 +52,9 @@ ATTRIBUTES = {
         ),
         "`design.write(path)` writes a table": "save to_csv export to_file",
         "`design.scaled(rms)` changes the amplitude": "scale rescale normalize rms",
-        "`design.experiments` is the number of experiments": "n_experiments",
+        "`design.experiments` is the number of experiments, those of all realizations together": (
+            "n_experiments n_realizations n_repeats num_realizations"
+        ),
     },
     "ExperimentData": {
         "each of the `len(data)` experiments has `data.u.shape[1]` samples": (
@@ -85,6 +94,7 @@ ATTRIBUTES = {
         "`hj.select_order(htf)` compares orders, and `print` shows its criteria": (
             "aic bic mdl aicc"
         ),
+        RESIDUALS: "residuals resid",
         "`hj.validate(model, data).plot()` shows residuals": (
             "plot_residuals plot_resid plot_diagnostics diagnostics"
         ),
@@ -128,6 +138,8 @@ ATTRIBUTES = {
             "magnitude gain mag db dcgain"
         ),
         "`np.angle(htf.H)` has it, and `hj.plot.bode(htf)` draws it": "phase angle",
+        "`htf.H[:, :, htf.outputs.index('y')]` has those of an output, and "
+        "`htf.plot(outputs='y')` draws them": "output get_output sel_output",
         "`htf.select(0)` is the HTF of one harmonic, and `htf[0]` its values": (
             "harmonic eval evaluate evalfr at loc iloc sel isel"
         ),
@@ -143,6 +155,9 @@ ATTRIBUTES = {
         "`htf.frequencies` are in cycles per period": "w omega f hz faxis fs",
     },
     "HybridSystem": {
+        MADE_OF_FUNCTIONS: (
+            "from_function from_field from_equations from_ode from_sympy from_dict from_modes"
+        ),
         "print the system: its parameters are its attributes": (
             "params parameters get_params parameter_names"
         ),
@@ -178,6 +193,9 @@ ATTRIBUTES = {
         "`model.dims` has the dimension of the state at each section": (
             "n_states order nx shape"
         ),
+        "a model is discrete: `model.A[k]` and `model.B[k]` go from section k to the next": (
+            "discretize to_discrete c2d sample resample"
+        ),
         "`len(model.inputs)` and `len(model.outputs)` are their numbers": (
             "n_inputs n_outputs nu ny"
         ),
@@ -186,8 +204,8 @@ ATTRIBUTES = {
         ),
         "`model.impulse_response(n_lags)` returns it": "impulse",
         CONTROL: (
-            "damp damping dcgain margin gramian gram norm hinf minreal balred ctrb obsv sample "
-            "to_tf to_ss c2d rlocus observability controllability"
+            "damp damping dcgain margin gramian gram norm hinf minreal balred ctrb obsv "
+            "to_tf to_ss rlocus observability controllability"
         ),
         "`hj.identify.fit_rational(model.htf(frequencies))` has zeros": "zeros",
     },
@@ -211,8 +229,11 @@ ATTRIBUTES = {
         "`cycle.sensitivity(parameter)` those to lasting changes": (
             "step impulse_response perturb push"
         ),
-        "`cycle.multipliers` has the eigenvalues, and `hj.sections.section_map(cycle, sections, "
-        "0, 0)` the return map between sections": "monodromy poincare_map poincare",
+        "`hj.linearize(cycle, sections).monodromy()` has it, and `cycle.multipliers` its "
+        "eigenvalues": "monodromy monodromy_matrix",
+        "`hj.sections.section_map(cycle, sections, 0, 0)` is the return map of a section": (
+            "poincare_map poincare"
+        ),
         "`1 / cycle.period` is the frequency": (
             "frequency freq rate cadence omega speed_of_rhythm"
         ),
@@ -267,6 +288,15 @@ ATTRIBUTES = {
             "filter notch_filter notch lowpass highpass bandpass smooth savgol detrend butter "
             "velocity derivative differentiate gradient normalize baseline rereference "
             "set_eeg_reference interpolate_bads"
+        ),
+        "`hj.read_recording(path)` reads files": (
+            "from_csv from_file read_csv read from_c3d from_mat from_path open from_raw"
+        ),
+        "`hj.Recording(table)` takes a table, such as a DataFrame": (
+            "from_dataframe from_pandas from_df from_table from_polars"
+        ),
+        "`hj.Recording(time, {'name': samples})` makes one of arrays": (
+            "from_arrays from_numpy from_dict"
         ),
         "`print(recording)` shows signals, units and rates": "info describe",
         "`recording.to_pandas().head()` shows the first samples": "head",
@@ -367,7 +397,8 @@ ATTRIBUTES = {
         ),
     },
     "Trajectory": {
-        "`trajectory.at(times)` has the states at any times, `trajectory.dense()` many": (
+        "`charts, states = trajectory.at(times)` interpolates, and `trajectory.dense()` has "
+        "many times": (
             "sol evaluate interpolation interp interpolate dense_output eval sample resample"
         ),
         "`trajectory.after` has the states (n, d) after each step, and `trajectory(name)` a "

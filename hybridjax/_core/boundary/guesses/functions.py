@@ -10,6 +10,8 @@ from .sentences import (
     DECAY,
     EXPONENT,
     HELD_OUT,
+    MADE_OF_FUNCTIONS,
+    RESIDUALS,
     SIGNAL,
     SOLVER,
 )
@@ -23,9 +25,10 @@ NAMES = {
         "use `fit.compare(other)`": "compare",
         "use `hj.Recording(time, signals, units=...)`": "create_info",
         "use `hj.validate(fit, data)`": (
-            "cross_val_score metrics score r2_score rmse residuals goodness whiteness "
+            "cross_val_score metrics score r2_score rmse goodness whiteness "
             "mean_squared_error compare_models evaluate"
         ),
+        RESIDUALS: "residuals resid",
         "use `hj.find_limit_cycle(system)`": (
             "find_cycle cycle periodic_orbit shooting periodic orbit limitcycle steady_state "
             "find_orbit bvp solve_bvp collocation"
@@ -33,7 +36,7 @@ NAMES = {
         "use `hj.testing.simulate_recording(cycle, inputs, outputs, rate)`": (
             "datasets synthetic fake_data example_data"
         ),
-        "use `hj.simulate(system, chart, state, duration)`": (
+        "use `hj.simulate(system, state, duration)`": (
             "diffeqsolve integrate odeint ode45 solve_ivp trajectory solve ode ivp simulation "
             "integrator"
         ),
@@ -113,8 +116,10 @@ NAMES = {
         "use `hj.scale.enable_progress()`": (
             "progress tqdmprogressmeter verbose set_log_level"
         ),
-        "use `hj.identify_subjects(table, folder)`": (
-            "subjects group population study"
+        "use `hj.identify_subjects(table, folder)`": "subjects population study",
+        "`hj.recordings.Population.from_fits(fits, {'subject': names, 'group': groups})"
+        ".difference('modulus', a, b)` compares two groups of fits": (
+            "group compare_groups group_difference compare_populations compare_subjects"
         ),
         HELD_OUT: (
             "train_test_split kfold cross_validate cross_val cv holdout split validation "
@@ -174,8 +179,7 @@ NAMES = {
         "`hj.Transition(name, source, target, guard, reset)` is an event of a system": (
             "reset guard discreteterminatingevent impact discrete_event terminal switch jump"
         ),
-        "subclasses of `hj.HybridSystem`, or `hj.HybridSystem.from_functions(states, field, "
-        "events)`, are systems": (
+        MADE_OF_FUNCTIONS: (
             "system model module odesystem hybrid_automaton vectorfield dynamical_system nlsys "
             "nonlinearsystem automaton mode domain iosys"
         ),
@@ -244,7 +248,11 @@ NAMES = {
         "use `hj.models.CompassGait()`": (
             "Walker walking compass biped gait Gait2392 inverted_pendulum"
         ),
-        "use `hj.models.PaddleJuggler()`": "bouncing_ball ball juggler",
+        "use `hj.models.PaddleJuggler()`": "juggler",
+        "use `hj.models.BouncingBall()`": "ball",
+        MADE_OF_FUNCTIONS: (
+            "relay thermostat feedback oscillator loop system mode relay_feedback"
+        ),
     },
     "plot": {
         "use `hj.plot.bode(htf)`": (

@@ -96,7 +96,7 @@ KEYWORDS = {
         "parameters belong to the system: `system.replace(k=9.0)` changes them": (
             "args"
         ),
-        "`trajectory.at(times)` has the states at any times": "t_eval saveat",
+        AT_TIMES: "t_eval saveat",
         "`time` is that at the beginning, and `duration` how long it lasts": (
             "t0 t_start start t1"
         ),
@@ -129,6 +129,8 @@ KEYWORDS = {
     },
     "read_recording": {
         "the file has a column with times, which `time` names": "time rate",
+        "`signals` chooses columns, and `hj.identify_recording` takes signals as `inputs` and "
+        "`outputs`": "inputs outputs u y channels columns",
         "headers and separators are recognized; `signals` chooses columns, `time` names that of "
         "time": (
             "sep delimiter header skiprows index_col encoding decimal names usecols preload"

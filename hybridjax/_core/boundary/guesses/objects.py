@@ -4,6 +4,19 @@ the step that leads there from the one it was given.
 Tables for `leads.py`.
 """
 
+from .sentences import AT_TIMES
+
+
+_OF_OUTPUT = (
+    "`htf.H[:, :, htf.outputs.index('y')]` has those of an output, and "
+    "`htf.plot(outputs='y')` draws them"
+)
+
+_OF_SAMPLES = (
+    "`hj.fitting.ObservedTrajectory(hj.Guess(chart, state), times, outputs, values)` makes one of "
+    "the samples of a recording"
+)
+
 MAKERS = {
     "AbstractSections": "`hj.ClockPhase(32)`, `hj.Crossing('y', 'falling')` or a list of these are "
     "sections",
@@ -133,7 +146,7 @@ STEPS = {
     (
         "AbstractObservation",
         "Recording",
-    ): "`hj.fitting.ObservedTrajectory(start, times, outputs, values)` makes one of values",
+    ): _OF_SAMPLES,
     (
         "AbstractObservation",
         "ExperimentData",
@@ -143,9 +156,11 @@ STEPS = {
 stands for those derived from it."""
 
 OBJECTS = {
-    "fit_multipliers.list": "`hj.select_order(htf)` compares orders",
-    "fit_multipliers.tuple": "`hj.select_order(htf)` compares orders",
-    "fit_series.list": "`hj.select_order(data)` compares orders",
+    **{
+        f"{function}.order.{kind}": f"`hj.select_order({given})` compares orders"
+        for function, given in (("fit_multipliers", "htf"), ("fit_series", "data"))
+        for kind in ("list", "tuple", "range", "ndarray")
+    },
     "multisine.LDTP": "pass `model.n_sections`",
     "run_experiments.LDTP": "`hj.experiments.simulate_experiments(model, design)` runs experiments "
     "on a model",
@@ -155,8 +170,10 @@ OBJECTS = {
     "Population.list": "`hj.recordings.Population.from_fits(fits, subjects)` takes fits",
     "responses.str": "`cycle.responses().curve('u')` is that to one input",
     "fluctuations.float": "name the signal: `white={'y': 0.01}`",
-    "fit_model.Identification": "`hj.fitting.ObservedSeries(result.data, sections)` makes one",
-    "fit_model.SectionData": "`hj.fitting.ObservedSeries(data, sections)` makes one",
+    "fit_model.free.dict": "initial values are those of the system, `system.replace(k=9.0)`, and a "
+    "dictionary has bounds, `{'k': (5.0, 20.0)}`",
+    "fit_model.Identification": f"{_OF_SAMPLES}; `result.compare(cycle)` compares multipliers",
+    "fit_model.SectionData": _OF_SAMPLES,
     "estimate_htf.LDTP": "`model.htf(frequencies)` is the exact HTF of a model",
     "fit_series.LDTP": "are the model and the data in the wrong order?",
     "continuation.int": "pass `(low, high)`, as in `hj.continuation(cycle, 'k', (0.1, 0.5))`",
@@ -174,11 +191,12 @@ OBJECTS = {
     "sample_sections.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
     "linearize.sections.dict": "`hj.Crossing('y', 'falling')` of a signal 'y' is one",
     "simulate.chart.Trajectory": "`hj.flow(system, flow, until)` goes on from the end of a flow",
-    "__call__.names.float": "`trajectory.at(times)` has the states at any times",
-    "__call__.names.int": "`trajectory.at(times)` has the states at any times",
+    "__call__.names.float": AT_TIMES,
+    "__call__.names.int": AT_TIMES,
     "multipliers.estimates.ndarray": "pass the fit, which has regions: `hj.plot.multipliers(true, "
     "fit)`",
     "simulate.u.Design": "`hj.experiments.simulate_experiments(model, design)` runs one on a model",
+    "simulate.state.dict": "a state by name needs no chart: `hj.simulate(system, state, duration)`",
     "simulate.chart.float": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
     "simulate.chart.int": "`hj.simulate(system, duration=1.0)` starts at the guess of the model",
     "identify_recording.sections.int": "it is the event at which cycles begin, such as "
@@ -199,6 +217,8 @@ OBJECTS = {
     "Branch.__getitem__.str": "`branch.values` has the values of the parameter, and "
     "`branch.to_pandas()` all numbers",
     "LimitCycle.trajectory.str": "`cycle.trajectory()('y')` has times and values of a signal",
+    "HTF.__getitem__.str": _OF_OUTPUT,
+    "HTF.select.str": _OF_OUTPUT,
     "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
     "multipliers.list": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",

@@ -7,7 +7,7 @@ HELD_OUT = (
     "`hj.validate(fit, other_data)` tries a fit on other data, and "
     "`hj.recordings.hold_out(result.data, order)` on cycles that were held out"
 )
-AT_TIMES = "`trajectory.at(times)` has the states at any times"
+AT_TIMES = "`charts, states = trajectory.at(times)` interpolates"
 SIGNAL = (
     "`scipy.signal` has it, for arrays such as `recording[name]`; `bandwidth`, an argument of "
     "`hj.identify_recording`, smooths signals"
@@ -24,6 +24,14 @@ EXPONENT = (
     "it follows from the multipliers: `np.log(max(result.modulus)) / period`; of a recording, "
     "`hj.identify_recording(recording, ...)` or `hj.recordings.natural_multipliers(data)` "
     "estimates them"
+)
+RESIDUALS = (
+    "residuals are `validation.measured - validation.simulated`, of `validation = "
+    "hj.validate(fit, data)`"
+)
+MADE_OF_FUNCTIONS = (
+    "`hj.HybridSystem.from_functions(('x', 'v'), field, events, {'k': 1.0})` makes a system of "
+    "functions (t, q, u, p), with parameters `p.k`; `events` are [(name, guard, reset)]"
 )
 COMPARE = "`fit.compare(other)` tests the difference from another fit or a truth"
 
