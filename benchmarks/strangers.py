@@ -10,6 +10,7 @@ Each row is a command. It prints a table with the number of draws and p-values.
     python benchmarks/strangers.py phase-long  # the same of four times as many
     python benchmarks/strangers.py loops    # fit_series and fit_ldtp where a reference is known
     python benchmarks/strangers.py weak     # fit_series of a pair beside a weak multiplier
+    python benchmarks/strangers.py distortion  # rhythms that respond a little nonlinearly
     python benchmarks/strangers.py study    # studies whose data support a lower order
     python benchmarks/strangers.py natural  # multipliers of rhythms that nobody perturbs
     python benchmarks/strangers.py plants   # machines in MuJoCo with other contacts and time steps
@@ -35,6 +36,7 @@ one_thread.pin()
 import numpy as np  # noqa: E402
 import strangers_beats as beats  # noqa: E402
 import strangers_dirt as dirt  # noqa: E402
+import strangers_distortion as weakly  # noqa: E402
 import strangers_plants  # noqa: E402
 import strangers_truth as truth  # noqa: E402
 from scipy import stats  # noqa: E402
@@ -46,6 +48,8 @@ import hybridjax as hj  # noqa: E402
 _WRONG = 5.0
 # Findings of phase responses that say how wide a band is: they name no reason why it is wrong.
 _OF_WIDTH = {"resolution", "wide", "slow input", "shape"}
+# Findings of recordings that name no reason why a multiplier may be wrong.
+_OF_BAND = {"band", "narrow excitation"}
 # Part of the phases at which a band of 95 % holds, below which it is missed.
 _MISSED = 0.9
 
@@ -420,6 +424,52 @@ def weak(draws: int) -> None:
         )
 
 
+def distortion(draws: int) -> None:
+    """Print how often regions of `identify_recording` hold the multiplier of rhythms whose response
+    is a little nonlinear, and how often the findings say so.
+
+    "off" is the rms error in standard errors; "silent" counts misses without any finding, "before"
+    those without another finding than distortion.
+    """
+    print(
+        "rhythm, noise, push                held  n   off  worst  distortion  silent  before"
+    )
+    quiet = [(name, 0.0, 1.0) for name in weakly.RHYTHMS]
+    first = next(iter(weakly.RHYTHMS))
+    noisy = [(first, 1e-4, 1.0), (first, 1e-4, 0.1), ("pendulum clock", 3e-4, 0.1)]
+    for name, noise, size in [*quiet, *noisy]:
+        made = weakly.pushed(weakly.RHYTHMS[name], range(draws), noise=noise, size=size)
+        found = [_of_pushed(made, k) for k in range(draws)]
+        held = np.array([x[0] for x in found])
+        off = np.array([x[1] for x in found])
+        causes = [x[2] for x in found]
+        named = sum("distortion" in x for x in causes)
+        silent = sum(not h and not x for h, x in zip(held, causes, strict=True))
+        before = sum(
+            not h and not x - {"distortion"} for h, x in zip(held, causes, strict=True)
+        )
+        label = f"{name}, {noise:g}, {size:g}"
+        print(
+            f"{label:34} {held.sum():4} {draws:2} {np.sqrt(np.mean(off**2)):5.1f} "
+            f"{off.max():6.1f} {named:11} {silent:7} {before:7}",
+            flush=True,
+        )
+
+
+def _of_pushed(made: weakly.Pushed, k: int) -> tuple[bool, float, set[str]]:
+    """Return whether the region holds the multiplier, the error in standard errors, and causes of
+    findings."""
+    signals = {"u": made.force[k], "x": made.position[k], "v": made.speed[k]}
+    recording = hj.Recording(made.time, signals)
+    result = hj.identify_recording(
+        recording, hj.Crossing("v", "falling"), "u", ("x", "v"), order=1, n_sections=8
+    )
+    fit = result.fit
+    error = abs(fit.multipliers[0] - made.multiplier) / fit.standard_errors[0]
+    causes = {finding.cause for finding in result.diagnosis.findings} - _OF_BAND
+    return bool(np.all(fit.contains([made.multiplier]))), float(error), causes
+
+
 def natural(draws: int) -> None:
     """Print how often intervals of natural multipliers hold the largest modulus, and in how many of
     the misses nothing is said."""
@@ -527,6 +577,7 @@ ROWS: dict[str, tuple[Callable[[int], None], int]] = {
     "series": (series, 60),
     "study": (study, 12),
     "weak": (weak, 60),
+    "distortion": (distortion, 40),
     "loops": (loops, 10),
     "phase": (phase, 30),
     "phase-long": (long_phase, 10),

@@ -99,11 +99,11 @@ class LDTPFit(WithCost, MultiplierFit):
     - `findings`: "feedback" if a controller sets the inputs of time series, or may do so (only
       without `references`); "drift" if a second fit to the first 1000 cycles of time series, in
       which outputs may drift, has other multipliers (they lie outside of each other's confidence
-      regions); "left over" if residuals depend on the inputs; "process noise" or "colored noise" if
-      residuals are correlated in time; "misfit" if residuals of HTFs are larger than their
-      variances, or similar at neighboring frequencies, because the dimensions are too few or the
-      iteration found a local minimum; "order" if one dimension less explains the data;
-      "undetermined"; "no convergence".
+      regions); "distortion" if residuals follow products of the outputs; "left over" if residuals
+      depend on the inputs; "process noise" or "colored noise" if residuals are correlated in time;
+      "misfit" if residuals of HTFs are larger than their variances, or similar at neighboring
+      frequencies, because the dimensions are too few or the iteration found a local minimum;
+      "order" if one dimension less explains the data; "undetermined"; "no convergence".
     """
 
     model: LDTP
@@ -444,7 +444,8 @@ def _doubts(
     grid: CycleGrid,
     error: Float[np.ndarray, "S T N ny"],
 ) -> list[Finding]:
-    """Return the most important finding about drift and about residuals that depend on inputs."""
+    """Return the most important finding about drift, about distortion, and about residuals that
+    depend on inputs."""
 
     def drifting() -> RoughFit:  # (from the fit on: half of the steps)
         begun = PreparedRecords(with_drift(records.records))
@@ -459,6 +460,11 @@ def _doubts(
         return unknown
     if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
+    # (Distortion is correlated in time, as other noise is, and would be named after it.)
+    predicted = np.where(grid.sampled, grid.y - error, 0.0)
+    order = len(fit.multipliers)
+    if distortion := residuals.about_distortion(grid, error, predicted, order):
+        return distortion
     # (References never respond to outputs.)
     direct = fit._coordinates.direct or outside is not records
     return residuals.about_misfit(outside.whole(), grid, error, how.innovations, direct)

@@ -88,7 +88,7 @@ from .records import (
     start_responses,
     with_drift,
 )
-from .residuals import about_answers
+from .residuals import about_answers, about_distortion
 
 
 _BIASED = "the fit is biased; name their `references`"
@@ -389,8 +389,8 @@ def _fit_open_loop(
     covariance, p_steady = _uncertainty(best.problem, best.solution)
     fit = assemble(best.problem, best.solution, covariance, best.converged)
     grid = records.whole()
-    left = grid.y - fit.predicted(grid, free_start)
-    error = np.where(grid.sampled, left, 0.0)
+    predicted = fit.predicted(grid, free_start)
+    error = np.where(grid.sampled, grid.y - predicted, 0.0)
     answers = about_answers(grid, error, records.inputs, _BIASED)
     drift = _about_drift(fit, records, free_start)
 
@@ -409,8 +409,9 @@ def _fit_open_loop(
         ]
         doubts = order_doubts(fit, higher) or left_out(higher[0])
     changes = [_CHANGES] if p_steady < _STEADY else []
+    distortion = about_distortion(grid, error, predicted, order)
     return dataclasses.replace(
-        fit, findings=(*fit.findings, *doubts, *changes, *answers)
+        fit, findings=(*fit.findings, *doubts, *distortion, *changes, *answers)
     )
 
 

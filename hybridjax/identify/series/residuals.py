@@ -1,9 +1,9 @@
 """Tests of residuals, section by section: correlations in time and with inputs.
 
 `hj.validate` calls `whiteness_test` and `independence_test` for data that were not fitted, and
-`whitened` to take the errors of the fit into account. Fits call `about_misfit` and `about_answers`,
-which return findings about residuals of the same data. If a good model is rejected, look at
-`whitened`; if feedback is reported where there is none, at `feedback_test`.
+`whitened` to take the errors of the fit into account. Fits call `about_misfit`, `about_distortion`
+and `about_answers`, which return findings about residuals of the same data. If a good model is
+rejected, look at `whitened`; if feedback is reported where there is none, at `feedback_test`.
 """
 
 from collections.abc import Sequence
@@ -44,6 +44,17 @@ _COLORED = 0.01
 # dimensions passes. Fewer: noise counts as too few dimensions.
 _SHIFTS = 8
 _ALONE = 4.0
+# Residuals are distortion if they follow products of the responses at this level, by more than this
+# part of their squares. Larger level, smaller part: right fits get a finding. Smaller level, larger
+# part: distortion passes, and standard errors are too small.
+_DISTORTED = 3e-3
+_LEAST_DISTORTION = 0.02
+# The largest number of patterns of a cycle of which products are taken, the number of shifts that
+# are compared, and the fewest cycles. More patterns: slow responses are lost among others. Fewer
+# shifts or cycles: the level is not held.
+_PATTERNS = 2
+_SHIFTED_CYCLES = 100
+_FEWEST_CYCLES = 40
 # Advice if inputs respond to residuals.
 FOR_WHITE_NOISE = (
     "the fit is biased; name their `references`, or pass noise='innovations'"
@@ -298,6 +309,72 @@ def _of_other_cycles(inputs: Signals, error: Signals) -> ByOutput:
         _, p, _ = independence_test(moved, error, lags, ANSWER)
         deviates.append(_deviates_of(p))
     return np.mean(deviates, axis=0)
+
+
+def about_distortion(
+    grid: CycleGrid, error: Signals, predicted: Signals, order: int
+) -> list[Finding]:
+    """Return a finding if residuals follow products of the responses, as nonlinearity makes them.
+
+    Such residuals depend on the inputs, and multipliers err together with them, by more than any
+    residuals show that are independent of the inputs. Only the patterns of a cycle count in which
+    the responses are largest: those of the slowest modes, in which distortion adds up.
+
+    **Arguments:** `error`, `predicted` outputs, on `grid`. `order`: the number of multipliers.
+    """
+    if is_exact(grid, error).all():
+        return []
+    kept = grid.inside.any(axis=2)
+    if kept.sum() < _FEWEST_CYCLES:
+        return []
+    left = np.where(grid.sampled, error, 0.0)
+    square = (left**2).sum(axis=(0, 1, 2)) / np.maximum(
+        grid.sampled.sum(axis=(0, 1, 2)), 1
+    )
+    noise = positive(np.sqrt(square))
+    response = np.where(grid.inside[..., None], predicted, 0.0) / noise
+    S, T, N, ny = response.shape
+    by_cycle = response.reshape(S, T, N * ny)
+    _, _, patterns = np.linalg.svd(by_cycle[kept], full_matrices=False)
+    patterns = patterns[: min(order, _PATTERNS)].T
+    along = by_cycle @ patterns
+    i, j = np.triu_indices(along.shape[2])
+    now = along[..., i] * along[..., j]
+    before = np.zeros_like(now)
+    before[:, 1:] = now[:, :-1]
+    products = np.concatenate([now, before], axis=2)[kept]
+    rest = ((left / noise).reshape(S, T, N * ny) @ patterns)[kept]
+    share, by_chance = _explained(rest, products)
+    mean = by_chance.mean()
+    variance = positive(by_chance.var())
+    # (Sums of squares are distributed like a multiple of chi squared.)
+    p = stats.gamma.sf(share, mean**2 / variance, scale=variance / mean)
+    if p > _DISTORTED or share - mean < _LEAST_DISTORTION:
+        return []
+    text = (
+        "residuals follow products of the responses, as nonlinear distortion does: errors of "
+        "multipliers may be twice as large as standard errors say. Push less: errors by distortion "
+        "fall in proportion."
+    )
+    return [Finding("distortion", text)]
+
+
+def _explained(
+    rest: Float[np.ndarray, "cycles d"], products: Float[np.ndarray, "cycles K"]
+) -> tuple[float, Float[np.ndarray, " shifts"]]:
+    """Return the share of squares that products explain, and that which products of other cycles
+    explain, shifted by whole numbers of cycles."""
+    rest = rest - rest.mean(axis=0)
+    rest = rest / positive(np.sqrt((rest**2).sum(axis=0)))
+    products = products - products.mean(axis=0)
+    basis, _ = np.linalg.qr(products / positive(np.abs(products).max(axis=0)))
+    cycles, d = rest.shape
+    shifts = np.unique(np.linspace(0.1, 0.9, _SHIFTED_CYCLES) * cycles // 1).astype(int)
+
+    def share(shift: int) -> float:
+        return float(((np.roll(basis, shift, axis=0).T @ rest) ** 2).sum() / d)
+
+    return share(0), np.array([share(shift) for shift in shifts])
 
 
 def about_answers(

@@ -1,0 +1,53 @@
+"""Residuals that are distortion of a nonlinear response have a finding, and noise has none."""
+
+import numpy as np
+import pytest
+
+import hybridjax as hj
+
+
+def series(seed, bend, cycles=150, noise=0.0, process=0.0):
+    """A slow mode (multiplier 0.72) that responds to its own square, times `bend`."""
+    rng = np.random.default_rng(seed)
+    n = 2 * (cycles + 20)
+    u = 0.01 * rng.normal(size=(n, 1))
+    x = np.zeros(n)
+    for k in range(n - 1):
+        decay, push = (0.9, 1.0) if k % 2 else (0.8, -0.7)
+        kick = process * 0.01 * rng.normal()
+        x[k + 1] = decay * x[k] + bend * x[k] ** 2 + push * u[k, 0] + kick
+    y = np.stack([x, 0.5 * x + 0.3 * bend * x**2], axis=1)[40:]
+    y += noise * y.std(axis=0) * rng.normal(size=y.shape)
+    y -= y.reshape(-1, 2, 2).mean(axis=0)[np.arange(len(y)) % 2]
+    return hj.experiments.SectionSeries(u[40:], y, n_sections=2, drift=np.inf)
+
+
+def causes(fit):
+    return [finding.cause for finding in fit.findings]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_distortion_is_named_in_fits_of_series(noise):
+    found = [
+        causes(hj.fit_series(series(k, 1.0, noise=noise), 1, check=False))
+        for k in range(10)
+    ]
+    assert sum("distortion" in x for x in found) >= 9
+
+
+@pytest.mark.parametrize("model", ["output", "innovations"])
+def test_distortion_is_named_in_state_space_models(model):
+    found = [
+        causes(hj.fit_ldtp(series(k, 1.0, noise=0.002), 1, noise=model))
+        for k in range(3)
+    ]
+    assert all("distortion" in x for x in found)
+
+
+@pytest.mark.parametrize("process", [0.0, 0.2])
+def test_noise_of_linear_systems_is_not_called_distortion(process):
+    found = [
+        causes(hj.fit_series(series(k, 0.0, 60, 0.1, process), 1, check=False))
+        for k in range(40)
+    ]
+    assert sum("distortion" in x for x in found) <= 2
