@@ -530,6 +530,19 @@ def test_a_guard_that_turns_where_it_is_touched():
             hj.flow(system, start, 9.0)
 
 
+def test_a_section_that_turns_where_it_is_touched():
+    def swing(t, q, u, p):
+        return q[1], 1.0 - q[0]
+
+    system = hj.HybridSystem.from_functions(("y", "v"), swing, inputs=())
+    start = hj.Guess("main", (1 - np.cos(1), np.sin(1)), 1.0)
+    for value, touched in ((0.0, True), (1e-12, True), (1e-3, False)):
+        section = hj.Crossing("y", "falling", value)
+        found = hj.flow(system, start, section, within=9.0, throw=False)
+        assert (found.result == Result.GRAZING) == touched
+    assert_allclose(found.t, 2 * np.pi - np.arccos(1 - 1e-3), rtol=1e-12)
+
+
 def test_small_values_that_are_no_touch():
     """A decay to a tiny threshold, and a ball that bounces ever lower, cross their guards."""
 
