@@ -6,6 +6,7 @@
     python benchmarks/conformance.py random          random piecewise systems against scipy
     python benchmarks/conformance.py random --count 100
     python benchmarks/conformance.py speed           a gradient after ten bounces
+    python benchmarks/conformance.py memory          reverse mode through 1000 events
 
 Prints `name.metric value` lines. `random` draws piecewise polynomial systems with two charts, four
 transitions, linear resets and guards that may depend on the time. Its other half (`scipy_flow`)
@@ -15,6 +16,7 @@ saltation matrices.
 
 import argparse
 import functools as ft
+import resource
 import time
 from typing import NamedTuple
 
@@ -318,8 +320,12 @@ def peers(options) -> None:
             show(f"{label}.error", float(np.abs(found - true).max()))
             show(f"{label}.first", first)
             show(f"{label}.again", later)
-    show("peers.ramp.diffrax_two_fields", diffrax_ramp(switched=False))
-    show("peers.ramp.diffrax_switched_field", diffrax_ramp(switched=True))
+    for label, switched in {"two_fields": False, "switched_field": True}.items():
+        run = ft.partial(diffrax_ramp, switched)
+        gradient, first, later = flows.timed(run, np.array([0.6]))
+        show(f"peers.ramp.diffrax_{label}", float(gradient))
+        show(f"peers.ramp.diffrax_{label}.first", first)
+        show(f"peers.ramp.diffrax_{label}.again", later)
 
 
 def _runs(name: str, jaxonomy: str) -> dict:
@@ -346,9 +352,9 @@ def _runs(name: str, jaxonomy: str) -> dict:
     }
 
 
-def diffrax_ramp(switched: bool) -> float:
-    """By two solves of diffrax, the first of which ends with an event; with a field for each, or,
-    as in issue 729, with one that is switched by the time."""
+def diffrax_ramp(switched: bool):
+    """A gradient by two solves of diffrax, the first of which ends with an event; with a field for
+    each, or, as in issue 729, with one that is switched by the time."""
     import diffrax
     import optimistix
 
@@ -375,14 +381,15 @@ def diffrax_ramp(switched: bool) -> float:
         last = solve(0.0, first.ts[-1], first.ys[-1], None)
         return last.ys[-1]
 
-    return float(jax.grad(value)(0.6))
+    gradient = jax.jit(jax.grad(value))
+    return lambda point: gradient(point[0])
 
 
 def many(options) -> None:
     """Balls that bounce ten times: CPU seconds of `flow`, and of its reverse mode inside of `jit`,
     by those of DOP853 in C at the same tolerance, and errors of the times."""
     loop = bounces.setup()
-    heights = np.linspace(0.5, 2.0, options.starts)
+    heights = np.linspace(0.5, 2.0, options.starts or 100_000)
     starts = np.stack([heights, 0 * heights], axis=1)
     numbers = 9.81, 0.9, 0.1
     settings = hj.orbits.Settings(rtol=options.tolerance)
@@ -417,6 +424,38 @@ def many(options) -> None:
     show("many.flow.error", float(np.abs(np.asarray(flow()) - accurate).max()))
     show("many.flow.by_c", again(flow, 2) / seconds)
     show("many.reverse.by_c", again(reverse, 2) / seconds)
+
+
+def memory(options) -> None:
+    """Balls that bounce 1000 times without loss: peak memory of the process during the gradient by
+    starts and parameters, above its peak before, and errors of the gradient."""
+    heights = np.linspace(0.5, 2.0, options.starts or 10_000)
+    starts = np.stack([heights, 0 * heights], axis=1)
+    numbers = jnp.array([9.81, 1.0])
+
+    @jax.jit
+    def gradient(starts, numbers):
+        def total(starts, numbers):
+            g, e = numbers
+            start = hj.Guess("air", starts)
+            thousand = dict(events=1000, within=2000.0, max_steps=4096)
+            return jnp.mean(hj.flow(Ball(g=g, e=e), start, **thousand).t)
+
+        return jax.grad(total, (0, 1))(starts, numbers)
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begin = time.process_time()
+    _, (by_g, by_e) = jax.block_until_ready(gradient(starts, numbers))
+    seconds = time.process_time() - begin
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    show("memory.gigabytes", (peak - before) * 1024 / 1e9)
+    show("memory.seconds", seconds)
+    # (The last of 1000 bounces comes at 1 + 2 (e + ... + e^999) times the time of the first.)
+    first = np.sqrt(2 * heights / 9.81)
+    by_g_exactly = np.mean(-0.5 * 1999 * first) / 9.81
+    by_e_exactly = np.mean(first) * 999 * 1000
+    show("memory.error.by_g", abs(float(by_g) / by_g_exactly - 1))
+    show("memory.error.by_e", abs(float(by_e) / by_e_exactly - 1))
 
 
 # Random systems.
@@ -741,7 +780,7 @@ def scipy_bounces(height: float) -> float:
     return t
 
 
-PARTS = ("rows", "peers", "many", "random", "speed")
+PARTS = ("rows", "peers", "many", "memory", "random", "speed")
 
 
 def main() -> None:
@@ -750,7 +789,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jaxonomy", default="python", help="its interpreter")
-    parser.add_argument("--starts", type=int, default=100_000)
+    parser.add_argument("--starts", type=int, help="of `many` and `memory`")
     parser.add_argument("--tolerance", type=float, default=1e-12)
     options = parser.parse_args()
     hj.enable_x64()

@@ -52,11 +52,15 @@ def first_crossing(
     d1: Values,
     armed: Flags,
     margin: Values | float = 0.0,
+    touching: Values | float = 0.0,
+    turn: Values | float = 0.0,
 ) -> CubicCrossing:
     """First falling zero of the cubic with values v0, v1 and slopes d0, d1 (per step).
 
     A guard that is not armed at the start counts only after it has become positive. `margin` is the
-    largest distance of the guard from the cubic halfway through the step.
+    largest distance of the guard from the cubic halfway through the step. An extremum is a touch,
+    too, if it lies within `touching` of zero, and if the guard changes by as much within `turn`
+    steps from there.
     """
     xp = namespace(v1)
     cubic = _Cubic.of(v0, v1, d0, d1)
@@ -89,12 +93,22 @@ def first_crossing(
     touch = xp.zeros_like(armed)
     near = xp.zeros_like(armed)
     was_positive = armed & (v0 > 0)
+
+    def touches(node, value):
+        bend = 2 * cubic.b + 6 * cubic.c * node
+        is_small = xp.abs(value) + _beside(node, margin) <= touching
+        return is_small & (2 * xp.abs(value) <= bend * turn**2)
+
+    # An extremum at the end of the step itself.
+    at_end = was_positive & (d1**2 <= 2 * (2 * cubic.b + 6 * cubic.c) * touching)
+    touch = touch | (at_end & touches(1.0, v1))
     for node, value, before in ((sa, va, was_positive), (sb, vb, va > 0)):
         is_minimum = cubic.b + 3 * cubic.c * node > 0
         dips = before & (node < 1) & is_minimum
         is_small = xp.abs(value) <= small
         sure = _beside(node, margin) <= small
         touch = touch | (dips & is_small & sure)
+        touch = touch | (dips & touches(node, value))
         is_near = (value > small) & (value < NEAR * scale)
         near = near | (dips & is_near)
     # Before the first crossing, the guard may have another sign than the cubic.

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 import hybridjax as hj
@@ -487,6 +487,84 @@ def test_a_guard_that_is_touched():
     assert_allclose(reverse(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
 
 
+def test_a_guard_that_turns_where_it_is_touched():
+    """Guards of time and of state, `1 - cos(t) + off`, that turn at zero, or a few errors of steps
+    above or below: the search comes to the touch in steps that shrink."""
+
+    def of_time(t, q, u, p):
+        return 1.0 - jnp.cos(t) + p.off
+
+    def of_state(t, q, u, p):
+        return q[0] + p.off
+
+    def swing(t, q, u, p):
+        return q[1], 1.0 - q[0]
+
+    def turn(t, q, u, p):
+        return q[0], -0.5 * q[1]
+
+    off = jnp.array([1e-3, 1e-14, 0.0, -1e-14, -1e-12, -1e-3])
+    touched = [False, True, True, True, True, False]
+    for guard in (of_time, of_state):
+        events = [("touch", guard, turn)]
+        system = hj.HybridSystem.from_functions(
+            ("y", "v"), swing, events, {"off": 0.0}, inputs=()
+        )
+        start = hj.Guess("main", (1 - np.cos(1), np.sin(1)), 1.0)
+
+        def first_event(x, system=system, start=start):
+            found = hj.flow(system.replace(off=x), start, 9.0)
+            return found.event_times[0], found
+
+        each = jax.vmap(jax.value_and_grad(first_event, has_aux=True))
+        (times, found), slopes = jax.jit(each)(off)
+        assert_array_equal(found.result == Result.GRAZING, touched)
+        assert_array_equal(found.count, [0, 0, 0, 0, 0, 1])
+        assert np.isnan(times[:-1]).all()
+        assert_allclose(times[-1], 2 * np.pi - np.arccos(1 - 1e-3), rtol=1e-12)
+        assert_allclose(slopes[-1], 1 / np.sqrt(1 - (1 - 1e-3) ** 2), rtol=1e-9)
+        for x, is_touched in zip(off, touched, strict=True):
+            alone = hj.flow(system.replace(off=x), start, 9.0, throw=False)
+            assert (alone.result == Result.GRAZING) == is_touched
+        with pytest.raises(ComputationError, match="tangentially"):
+            hj.flow(system, start, 9.0)
+
+
+def test_a_section_that_turns_where_it_is_touched():
+    def swing(t, q, u, p):
+        return q[1], 1.0 - q[0]
+
+    system = hj.HybridSystem.from_functions(("y", "v"), swing, inputs=())
+    start = hj.Guess("main", (1 - np.cos(1), np.sin(1)), 1.0)
+    for value, touched in ((0.0, True), (1e-12, True), (1e-3, False)):
+        section = hj.Crossing("y", "falling", value)
+        found = hj.flow(system, start, section, within=9.0, throw=False)
+        assert (found.result == Result.GRAZING) == touched
+    assert_allclose(found.t, 2 * np.pi - np.arccos(1 - 1e-3), rtol=1e-12)
+
+
+def test_small_values_that_are_no_touch():
+    """A decay to a tiny threshold, and a ball that bounces ever lower, cross their guards."""
+
+    def decay(t, q, u, p):
+        return (-q[0],)
+
+    def stop(t, q, u, p):
+        return (q[0] + 1.0,)
+
+    events = [("stop", lambda t, q, u, p: q[0] - p.low, stop)]
+    system = hj.HybridSystem.from_functions(
+        ("x",), decay, events, {"low": 1e-12}, inputs=()
+    )
+    for low in (1e-6, 1e-12):
+        found = hj.flow(system.replace(low=low), (1.0,), "stop", within=40.0)
+        assert_allclose(found.t, -np.log(low), rtol=1e-10)
+    e = 0.1
+    found = hj.flow(ball(e=e), DROP, events=5, within=2.0)
+    exact = FIRST * (1 + 2 * sum(e**k for k in range(1, 5)))
+    assert_allclose(found.t, exact, rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_so_many_flows_that_they_are_computed_part_by_part(monkeypatch):
     """The last part is filled up; reverse mode of a program searches the parts again."""
@@ -767,6 +845,21 @@ def test_events_at_the_start_and_at_the_end():
         assert "needs a chart of its own" in falls.findings[0].text
     rises = hj.flow(ball(g=-9.81), rests, 0.1)
     assert rises.findings == ()
+
+
+@pytest.mark.parametrize("power", [3, 4, 5])
+def test_a_start_at_rest_that_falls_with_a_power_of_time(power):
+    """Through a chain of integrators, of which the first is the guard."""
+
+    def rates(t, q, u, p):
+        return (*q[1:], p.push)
+
+    events = [("floor", lambda t, q: q[0], lambda t, q: q)]
+    names = tuple(f"x{k}" for k in range(power))
+    for push, causes in ((-1.0, ["on a guard"]), (1.0, [])):
+        system = hj.HybridSystem.from_functions(names, rates, events, {"push": push})
+        moved = hj.flow(system, np.zeros(power), 1.0, throw=False)
+        assert [x.cause for x in moved.findings] == causes
 
 
 @pytest.mark.parametrize(

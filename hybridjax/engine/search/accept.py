@@ -28,6 +28,10 @@ from .state import Aim, Attempt, State, Task
 _CAUTION = 0.9
 _SHRINK = 0.2
 _GROW = 3.0
+# Only an extremum that lies at most this part of a step from zero, in time, is a touch. Higher: a
+# function that decays to small values, as a population does, is called grazing. Lower: a grazing is
+# missed where other states require short steps.
+TURN = 0.1
 
 
 class Verdict(NamedTuple):
@@ -106,7 +110,7 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
     moved = step_length(aim, new)
     # (If an event happens at once, the step has no length, and nothing is crossed.)
     ready = state.ready & ~aim.at_once
-    crossing = _crossing(looked_at & ~aim.at_once, state, new, moved, ready)
+    crossing = _crossing(looked_at & ~aim.at_once, state, new, moved, ready, task)
     zero = width(t, task.span, end.rate)
     chosen = lands & (np.arange(len(zero))[:, None] == aim.which)
     at_end = lands & (xp.abs(end.value) <= zero)
@@ -124,7 +128,7 @@ def accept(state: State, aim: Aim, new: Attempt, t: Times, task: Task) -> Verdic
         crosses=crosses,
         closer=closer,
         lost=failed & ~closer,
-        touch=fresh & ~crosses & (crossing.touch & ~chosen).any(axis=0),
+        touch=looked_at & ~crosses & (crossing.touch & ~chosen).any(axis=0),
         which=xp.argmin(positions, axis=0).astype(xp.int32),
         position=position,
         chosen=chosen & lands,
@@ -158,7 +162,12 @@ def of_row(x: Array, which: Index) -> Times:
 
 
 def _crossing(
-    some: Mask, state: State, new: Attempt, moved: Times, ready: Bool[Array, "W L"]
+    some: Mask,
+    state: State,
+    new: Attempt,
+    moved: Times,
+    ready: Bool[Array, "W L"],
+    task: Task,
 ) -> CubicCrossing:
     """The crossings on the way. (In a branch: otherwise XLA would compute them once for every
     use.)"""
@@ -169,6 +178,10 @@ def _crossing(
     no = xp.zeros_like(ready)
     nowhere = xp.full_like(end.value, xp.inf)
     none = CubicCrossing(nowhere, no, no)
-    return cond(
-        some.any(), lambda: first_crossing(*cubic, ready, new.margin), lambda: none
-    )
+
+    def find():
+        turn = TURN * state.h / xp.where(moved > 0, moved, xp.inf)
+        touching = state.touching(task.settings)
+        return first_crossing(*cubic, ready, new.margin, touching, turn)
+
+    return cond(some.any(), find, lambda: none)

@@ -184,7 +184,10 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
             # no speed of the crossing can be computed.)
             judged = chosen & (xp.abs(before.value) > width(t, task.span, before.rate))
             ready = take_rows(state.ready, rows)
-            far, slow = _clearance(before, after, margin, moved, ready, judged)
+            touching = take_rows(state.touching(task.settings), rows)
+            far, slow = _clearance(
+                before, after, margin, moved, ready, judged, touching
+            )
             calm = (far | chosen).all(axis=0) & ~bent & ~slow
             out = out._replace(
                 watched=write(out.watched, rows, here, after),
@@ -330,15 +333,15 @@ def _clearance(
     moved: AnyTimes,
     armed: Flags,
     judged: Flags,
+    touching: Float[Array, "W L"],
 ) -> tuple[Flags, Mask]:
     """Test whether watched functions stay away from zero, by bounds of their interpolants and
     margins. Also find lanes that land at a vanishing speed, on zeros that are `judged`."""
     xp = namespace(moved)
     ends = before.value, after.value, moved * before.rate, moved * after.rate
     low, high = bounds(*ends, margin)
-    far = xp.where(
-        armed, low > NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1])), high <= 0
-    )
+    near = NEAR * xp.maximum(xp.abs(ends[0]), xp.abs(ends[1]))
+    far = xp.where(armed, low > xp.maximum(near, touching), high <= 0)
     fastest = xp.maximum(xp.abs(ends[2]), xp.abs(ends[0]))
     # (With rounding errors, the zero may lie a little before the start.)
     return far, (judged & (xp.abs(moved) * after.rate > -SLOW * fastest)).any(axis=0)

@@ -8,7 +8,7 @@ is wrong, look there; if a state after an event is wrong, look at `_reset`.
 """
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..._core.executor import cond, namespace, put
 from ..._core.results import Result, update_result
@@ -32,7 +32,7 @@ from ..events import (
 from ..lanes import ARRIVE_LEVEL, ARRIVE_TIME, IDLE, MOVE, Lanes, Tape
 from ..settings import ROUNDING
 from ..watch import Watch, watch
-from .accept import Verdict, accept, next_step, of_row, step_length
+from .accept import TURN, Verdict, accept, next_step, of_row, step_length
 from .attempt import SLOW, deviation
 from .state import Aim, Approach, Attempt, State, Task
 
@@ -74,6 +74,7 @@ def without_events(
     end = state._replace(
         lanes=lanes,
         watched=_merge(active, new.watched, state.watched),
+        highest=_highest(state, active, new.watched),
         h=xp.where(active, h, state.h),
         along=new.along,
         error=state.error + xp.where(active, new.error, 0.0),
@@ -110,7 +111,9 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     arrived = on_time | level | ((fired >= 0) & (fired == target.event))
     if target.count is not None:
         arrived = arrived | ((fired >= 0) & (lanes.events + 1 >= target.count))
-    after, watched, aimed, zeno, slow = _after(state, aim, new, verdict, fired, t, task)
+    after, watched, aimed, fired, zeno, slow = _after(
+        state, aim, new, verdict, fired, t, task
+    )
     h, stuck = _next_step(state, aim, new, verdict, fired, task)
     # Failures; the first one counts.
     grazes = verdict.touch | (slow & ~zeno) | (stuck & (verdict.refine | verdict.lost))
@@ -144,6 +147,7 @@ def with_events(state: State, aim: Aim, new: Attempt, task: Task) -> tuple[State
     end = State(
         lanes=after,
         watched=watched,
+        highest=_highest(state, accepted, new.watched, watched, fired),
         aimed=aimed,
         approach=_approach(state, new, verdict, moved),
         h=h,
@@ -172,10 +176,11 @@ def _after(
     fired: Index,
     t: Times,
     task: Task,
-) -> tuple[Lanes, Watch, Mask, Mask, Mask]:
-    """The state after steps and events. Returns the lanes, their watched functions, and three
-    masks: the next fall of the target's level counts (`level_counts`), events accumulate, a zero is
-    crossed at a vanishing speed."""
+) -> tuple[Lanes, Watch, Mask, Index, Mask, Mask]:
+    """The state after steps and events. Returns the lanes, their watched functions, whether the
+    next fall of the target's level counts (`level_counts`), the events that happened, and two
+    masks: events accumulate, a zero is crossed at a vanishing speed. Such a zero is no event, as
+    its time means nothing, unless events accumulate."""
     lanes = state.lanes
     end = new.watched
     accepted = verdict.accepted
@@ -193,6 +198,7 @@ def _after(
     passed = xp.where(accepted, step_length(aim, new), 0.0)
     count = len(task.s.transitions)
     pace, zeno = keep_pace(lanes.pace, passed, fired >= 0, slow, task.span, count)
+    fired = xp.where(slow & ~zeno, -1, fired)
     t = xp.where(accepted, t, lanes.t)
     waiting = await_schedules(task.s, lanes.armed, lanes.t, t) & ~due[:-1]
     after = Lanes(
@@ -205,33 +211,36 @@ def _after(
     )
     watched = _merge(accepted, end, state.watched)
     end = _reset(after, watched, ready[-1], fired, task)
-    return *end, zeno, slow
+    return *end, fired, zeno, slow
 
 
 def _is_shallow(
     state: State, aim: Aim, new: Attempt, verdict: Verdict, t: Times, task: Task
 ) -> Mask:
-    """Test which lanes land on the zero of a guard that would turn a few rounding errors below
-    zero."""
+    """Test which lanes land on a zero that errors decide about: the watched function would turn a
+    few errors of steps, or rounding errors of a guard, below zero."""
     s = task.s
-    if not s.transitions:
-        return verdict.lands & False
     lanes = state.lanes
-    approach = state.approach
     xp = namespace(t)
-    speed = xp.abs(of_row(new.watched.rate, aim.which))
-    before = xp.abs(of_row(state.watched.rate, aim.which))
-    rate = xp.where(approach.on, approach.rate, before)
-    length = xp.where(approach.on, approach.reach, step_length(aim, new))
-    slower = verdict.lands & (speed < _MAY_BE_SHALLOW * rate) & (length > 0)
+    rate = of_row(new.watched.rate, aim.which)
+    before = of_row(state.watched.rate, aim.which)
+    speed = xp.abs(rate)
+    length = step_length(aim, new)
+    lands = verdict.lands & (length > 0)
+    bend = xp.maximum(rate - before, 0.0) / xp.where(lands, length, 1.0)
+    touching = of_row(state.touching(task.settings), aim.which)
+    turns_soon = speed < TURN * state.h * bend
+    touches = lands & turns_soon & (speed**2 < 2 * touching * bend)
+    if not s.transitions:
+        return touches
+    slower = lands & (speed < _MAY_BE_SHALLOW * xp.abs(before))
     at_guard = lanes._replace(t=t, q=new.q)
 
     def rounding():
         return of_row(guard_noise(s, at_guard, task.u, slower), aim.which)
 
     error = cond(slower.any(), rounding, lambda: xp.zeros_like(t))
-    bend = rate / xp.where(slower, length, 1.0)
-    return slower & (speed**2 < _SHALLOW * error * bend)
+    return touches | (slower & (speed**2 < _SHALLOW * error * bend))
 
 
 def _reset(
@@ -354,6 +363,23 @@ def level_counts(watched: Watch, span: Times) -> Mask:
     """Test whether the target's level is clearly positive, so that its next fall through zero ends
     the flow."""
     return watched.value[-1] > SAME_TIME * span * abs(watched.rate[-1])
+
+
+def _highest(
+    state: State,
+    accepted: Mask,
+    end: Watch,
+    after: Watch | None = None,
+    fired: Index | None = None,
+) -> Float[Array, "W L"]:
+    """The `State.highest` after steps that end at `end`, and after the events `fired` there."""
+    xp = namespace(accepted)
+    height = xp.abs(end.value)
+    highest = xp.where(accepted, xp.maximum(state.highest, height), state.highest)
+    if after is None or fired is None:
+        return highest
+    changes = (after.value != end.value) | (after.rate != end.rate)
+    return xp.where((fired >= 0) & changes, xp.abs(after.value), highest)
 
 
 def _merge(mask: Mask, new: Watch, old: Watch) -> Watch:

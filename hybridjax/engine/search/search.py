@@ -109,6 +109,7 @@ def _begin(lanes: Lanes, result: Index, task: Task, new_input: bool) -> State:
     return State(
         lanes=armed,
         watched=watched,
+        highest=xp.abs(watched.value),
         aimed=counts,
         approach=Approach(no, none, zero, zero, zero, none),
         h=task.stride.h,

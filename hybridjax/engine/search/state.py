@@ -15,10 +15,19 @@ from ..._core.executor import namespace
 from ..._core.results import Result
 from ...systems.structure import Structure
 from ..arrays import Array, Index, Inputs, Mask, Padded, Times
+from ..cubic import TOUCH
 from ..lanes import Lanes, Tape
 from ..settings import Settings
 from ..target import Target
 from ..watch import Watch
+
+
+# An extremum is a touch within this many times the error of a step, as a part of the watched
+# function's largest magnitude, and within at most the part `_MOST`. Higher: crossings whose
+# derivatives are right to two digits are called grazing. Lower: derivatives at a touch are made of
+# errors of steps.
+_ERRORS = 100.0
+_MOST = 1e-6
 
 
 class Stride(NamedTuple):
@@ -106,6 +115,9 @@ class State(NamedTuple):
     lanes: Lanes
     watched: Watch
     """The watched functions at the lanes."""
+    highest: Float[Array, "W L"]
+    """Largest magnitude of each watched function at the ends of steps, since the start or the last
+    event that changed its value or rate. Rounding and errors of steps are a part of it."""
     aimed: Mask
     """Whether the next fall of the target's level through zero ends the flow."""
     approach: Approach
@@ -120,6 +132,14 @@ class State(NamedTuple):
     arrived: Mask
     i: Int[Array, ""]
     """Number of iterations so far."""
+
+    def touching(self, settings: Settings) -> Float[Array, "W L"]:
+        """The magnitude of each watched function below which an extremum is a touch: errors of
+        steps decide whether it crosses zero."""
+        xp = namespace(self.aimed)
+        assert settings.rtol is not None
+        part = xp.clip(_ERRORS * xp.asarray(settings.rtol), TOUCH, _MOST)
+        return part * self.highest
 
     @property
     def active(self) -> Mask:
