@@ -25,7 +25,7 @@ from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Index
 from .._core.compilation import at_ease, identity
 from .._core.execution import Execution
-from .._core.executor import from_host, to_host
+from .._core.executor import OutOfTimeError, at_most, from_host, to_host
 from .._core.meaning import current_of_many, first_of
 from .._core.memo import Memory, remembered
 from .._core.precision import require_x64
@@ -282,13 +282,10 @@ def solved(
     tiles = tiles_of(systems, map, size, workers)._replace(known=known)
     if not checked or not has_route(map):
         return as_cycles(tiles, tiles.solve(S))
-    kind = identity((map,))
-    # (Once searches have taken as long as compilation does, it is likely that more sweeps follow.)
-    if S < WORTH_COMPILING and _searching[kind] < compilation.WORTH_COMPILING:
-        begin = time.process_time()
-        rounds = tiles.solve(S)
-        _searching[kind] += time.process_time() - begin
-        return as_cycles(tiles, rounds)
+    if S < WORTH_COMPILING:
+        rounds = _searched(tiles, S)
+        if rounds is not None:
+            return as_cycles(tiles, rounds)
     expected = np.full(S, float(map.expected))
     expected = expected if tiles.periods is None else tiles.periods
     times = np.full(S, float(tiles.map.anchor.t[0]))
@@ -322,6 +319,24 @@ def solved(
         cycles = _with_rows(cycles, left, _cycles(part, rounds))
         together[left] = rounds.together
     return examined(cycles, together, solver.found.path >= 0)
+
+
+def _searched(tiles: Tiles, S: int) -> Rounds | None:
+    """The cycles of a small sweep by searches. None if the compiled itinerary is the quicker way:
+    searches of this class have taken as long as compilation does, in earlier sweeps, or this one
+    takes twice as long."""
+    kind = identity((tiles.map,))
+    limit = compilation.WORTH_COMPILING
+    if _searching[kind] >= limit:
+        return None
+    begin = time.thread_time()
+    try:
+        with at_most(2 * limit):
+            return tiles.solve(S)
+    except OutOfTimeError:
+        return None
+    finally:
+        _searching[kind] += time.thread_time() - begin
 
 
 def _search(map: ReturnMap) -> ReturnMap | None:

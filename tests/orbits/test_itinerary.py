@@ -232,18 +232,25 @@ def test_systems_on_several_routes_are_those_of_single_searches(monkeypatch):
 
 @pytest.mark.slow
 def test_small_sweeps_follow_the_itinerary_after_long_searches(free, monkeypatch):
-    """They are searched at first, since compiling takes longer than a few searches."""
+    """They are searched at first, since compiling takes longer than a few searches. A search that
+    takes too long is given up."""
     drives = [0.25, 0.3, 0.35]
     systems = [Rebound(drive=x) for x in drives]
     monkeypatch.setattr(limit_cycles, "_searching", collections.Counter())
     searched = hj.orbits.find_limit_cycles(systems, free)
+    assert limit_cycles._searching.total() > 0, "they were not searched"
 
-    monkeypatch.setattr(compilation, "WORTH_COMPILING", 0.0)
-    monkeypatch.setattr(batches.Tiles, "solve", None)
-    followed = hj.orbits.find_limit_cycles(systems, free)
+    def followed():
+        return hj.orbits.find_limit_cycles(systems, free)
 
-    assert searched.ok.all() and followed.ok.all()
-    assert_allclose(followed.anchor.q, searched.anchor.q, rtol=1e-8)
+    monkeypatch.setattr(compilation, "WORTH_COMPILING", 1e-9)
+    after_long_searches = followed()
+    monkeypatch.setattr(limit_cycles, "_searching", collections.Counter())
+    given_up = followed()
+
+    for cycles in (searched, after_long_searches, given_up):
+        assert cycles.ok.all()
+        assert_allclose(cycles.anchor.q, searched.anchor.q, rtol=1e-8)
 
 
 def test_programs_of_many_systems_factorize_nothing(free):
