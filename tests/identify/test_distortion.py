@@ -1,5 +1,7 @@
 """Residuals that are distortion of a nonlinear response have a finding, and noise has none."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -35,13 +37,27 @@ def test_distortion_is_named_in_fits_of_series(noise):
     assert sum("distortion" in x for x in found) >= 9
 
 
-@pytest.mark.parametrize("model", ["output", "innovations"])
-def test_distortion_is_named_in_state_space_models(model):
+@pytest.mark.parametrize(
+    "model, named",
+    [("output", {"distortion"}), ("innovations", {"distortion", "colored noise"})],
+)
+def test_distortion_is_named_in_state_space_models(model, named):
     found = [
         causes(hj.fit_ldtp(series(k, 1.0, noise=0.002), 1, noise=model))
         for k in range(3)
     ]
-    assert all("distortion" in x for x in found)
+    assert all(named & set(x) for x in found)
+
+
+def test_curved_sensors_are_not_called_distortion():
+    """Regions hold with them."""
+    found = []
+    for k in range(10):
+        data = series(k, 0.0, noise=0.1)
+        curved = data.y + 0.1 * data.y**2 / data.y.std()
+        data = dataclasses.replace(data, y=curved)
+        found.append(causes(hj.fit_series(data, 1, check=False)))
+    assert sum("distortion" in x for x in found) <= 1
 
 
 @pytest.mark.parametrize("process", [0.0, 0.2])

@@ -99,7 +99,7 @@ class LDTPFit(WithCost, MultiplierFit):
     - `findings`: "feedback" if a controller sets the inputs of time series, or may do so (only
       without `references`); "drift" if a second fit to the first 1000 cycles of time series, in
       which outputs may drift, has other multipliers (they lie outside of each other's confidence
-      regions); "distortion" if residuals follow products of the outputs; "left over" if residuals
+      regions); "distortion" if residuals follow products of earlier outputs; "left over" if they
       depend on the inputs; "process noise" or "colored noise" if residuals are correlated in time;
       "misfit" if residuals of HTFs are larger than their variances, or similar at neighboring
       frequencies, because the dimensions are too few or the iteration found a local minimum;
@@ -460,11 +460,14 @@ def _doubts(
         return unknown
     if contradicted_by(fit, [drifting], OF_DRIFT) is not None:
         return [MAY_DRIFT]
-    # (Distortion is correlated in time, as other noise is, and would be named after it.)
-    predicted = np.where(grid.sampled, grid.y - error, 0.0)
-    order = len(fit.multipliers)
-    if distortion := residuals.about_distortion(grid, error, predicted, order):
-        return distortion
+    # (Distortion is correlated in time, as process noise is, which would be named in its place. A
+    # fit of innovations calls it colored noise.)
+    if not how.innovations:
+        predicted = np.where(grid.sampled, grid.y - error, 0.0)
+        c = fit.coefficients
+        distortion = residuals.about_distortion(grid, error, predicted, c)
+        if distortion:
+            return distortion
     # (References never respond to outputs.)
     direct = fit._coordinates.direct or outside is not records
     return residuals.about_misfit(outside.whole(), grid, error, how.innovations, direct)

@@ -409,7 +409,7 @@ def _fit_open_loop(
         ]
         doubts = order_doubts(fit, higher) or left_out(higher[0])
     changes = [_CHANGES] if p_steady < _STEADY else []
-    distortion = about_distortion(grid, error, predicted, order)
+    distortion = about_distortion(grid, error, predicted, fit.coefficients)
     return dataclasses.replace(
         fit, findings=(*fit.findings, *doubts, *distortion, *changes, *answers)
     )

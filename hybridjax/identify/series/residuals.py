@@ -15,9 +15,16 @@ from jaxtyping import Bool, Float
 from scipy import special, stats
 
 from ..._core.findings import Finding
-from ..descent import ROUNDING, positive
+from ..denominator import fading
+from ..descent import ROUNDING, Coefficients, positive
 from .output_error import RANK
-from .records import CycleGrid, Signals, lagged_inputs
+from .records import (
+    CycleGrid,
+    Signals,
+    delay_cycles,
+    divide_by_chi,
+    lagged_inputs,
+)
 
 
 Root = Float[np.ndarray, "S T ny r"]
@@ -44,7 +51,7 @@ _COLORED = 0.01
 # dimensions passes. Fewer: noise counts as too few dimensions.
 _SHIFTS = 8
 _ALONE = 4.0
-# Residuals are distortion if they follow products of the responses at this level, by more than this
+# Residuals are distortion if they follow products of responses at this level, by more than this
 # part of their squares. Larger level, smaller part: right fits get a finding. Smaller level, larger
 # part: distortion passes, and standard errors are too small.
 _DISTORTED = 3e-3
@@ -312,15 +319,18 @@ def _of_other_cycles(inputs: Signals, error: Signals) -> ByOutput:
 
 
 def about_distortion(
-    grid: CycleGrid, error: Signals, predicted: Signals, order: int
+    grid: CycleGrid, error: Signals, predicted: Signals, c: Coefficients
 ) -> list[Finding]:
-    """Return a finding if residuals follow products of the responses, as nonlinearity makes them.
+    """Return a finding if residuals follow products of earlier responses, as nonlinearity makes
+    them.
 
     Such residuals depend on the inputs, and multipliers err together with them, by more than any
-    residuals show that are independent of the inputs. Only the patterns of a cycle count in which
-    the responses are largest: those of the slowest modes, in which distortion adds up.
+    residuals show that are independent of the inputs. Distortion adds up in the slowest modes:
+    therefore only those patterns of a cycle count in which the responses are largest, and products
+    that are filtered by 1 / chi. Curved sensors distort single samples, which does no such harm:
+    products of the same cycle are left out.
 
-    **Arguments:** `error`, `predicted` outputs, on `grid`. `order`: the number of multipliers.
+    **Arguments:** `error`, `predicted` outputs, on `grid`. `c`: the coefficients of chi.
     """
     if is_exact(grid, error).all():
         return []
@@ -336,15 +346,13 @@ def about_distortion(
     S, T, N, ny = response.shape
     by_cycle = response.reshape(S, T, N * ny)
     _, _, patterns = np.linalg.svd(by_cycle[kept], full_matrices=False)
-    patterns = patterns[: min(order, _PATTERNS)].T
-    along = by_cycle @ patterns
-    i, j = np.triu_indices(along.shape[2])
-    now = along[..., i] * along[..., j]
-    before = np.zeros_like(now)
-    before[:, 1:] = now[:, :-1]
-    products = np.concatenate([now, before], axis=2)[kept]
-    rest = ((left / noise).reshape(S, T, N * ny) @ patterns)[kept]
-    share, by_chance = _explained(rest, products)
+    patterns = patterns[: min(len(c), _PATTERNS)].T
+    now = _products(by_cycle @ patterns)
+    now = np.where(kept[..., None], now - now[kept].mean(axis=0), 0.0)
+    earlier = divide_by_chi(fading(c), delay_cycles(now, 1))
+    dynamic = _without_sensors(grid, left / noise, response)
+    rest = dynamic.reshape(S, T, N * ny) @ patterns
+    share, by_chance = _explained(rest[kept], earlier[kept], now[kept])
     mean = by_chance.mean()
     variance = positive(by_chance.var())
     # (Sums of squares are distributed like a multiple of chi squared.)
@@ -352,22 +360,45 @@ def about_distortion(
     if p > _DISTORTED or share - mean < _LEAST_DISTORTION:
         return []
     text = (
-        "residuals follow products of the responses, as nonlinear distortion does: errors of "
-        "multipliers may be twice as large as standard errors say. Push less: errors by distortion "
-        "fall in proportion."
+        "residuals follow products of earlier responses, as nonlinear distortion does: standard "
+        "errors are too small, by a factor of two or more. Push less: errors by distortion fall in "
+        "proportion."
     )
     return [Finding("distortion", text)]
 
 
+def _products(x: Float[np.ndarray, "*rows k"]) -> Float[np.ndarray, "*rows K"]:
+    i, j = np.triu_indices(x.shape[-1])
+    return x[..., i] * x[..., j]
+
+
+def _without_sensors(grid: CycleGrid, left: Signals, response: Signals) -> Signals:
+    """Return residuals without what products of the outputs at their own sample explain, as curved
+    sensors make it."""
+    out = left.copy()
+    for n, i in np.ndindex(left.shape[2:]):
+        sampled = grid.sampled[:, :, n, i]
+        static = _products(response[:, :, n])[sampled]
+        columns = np.concatenate([np.ones((len(static), 1)), static], axis=1)
+        e = left[:, :, n, i][sampled]
+        by_static, *_ = np.linalg.lstsq(columns, e)
+        out[:, :, n, i][sampled] = e - columns @ by_static
+    return out
+
+
 def _explained(
-    rest: Float[np.ndarray, "cycles d"], products: Float[np.ndarray, "cycles K"]
+    rest: Float[np.ndarray, "cycles d"],
+    products: Float[np.ndarray, "cycles K"],
+    others: Float[np.ndarray, "cycles K"],
 ) -> tuple[float, Float[np.ndarray, " shifts"]]:
-    """Return the share of squares that products explain, and that which products of other cycles
-    explain, shifted by whole numbers of cycles."""
-    rest = rest - rest.mean(axis=0)
+    """Return the share of squares that products explain beyond others, and that which they explain
+    when they are shifted by whole numbers of cycles."""
+    others = others / positive(np.abs(others).max(axis=0))
+    products = products / positive(np.abs(products).max(axis=0))
+    known, _ = np.linalg.qr(np.concatenate([np.ones((len(rest), 1)), others], axis=1))
+    rest = rest - known @ (known.T @ rest)
     rest = rest / positive(np.sqrt((rest**2).sum(axis=0)))
-    products = products - products.mean(axis=0)
-    basis, _ = np.linalg.qr(products / positive(np.abs(products).max(axis=0)))
+    basis, _ = np.linalg.qr(products - known @ (known.T @ products))
     cycles, d = rest.shape
     shifts = np.unique(np.linspace(0.1, 0.9, _SHIFTED_CYCLES) * cycles // 1).astype(int)
 
