@@ -188,6 +188,13 @@ def dips(v0, v1, d0, d1) -> Flags:
     return (v0 > 0) & (v1 > 0) & is_negative
 
 
+def bend_at_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
+    """The second derivative, per step, of the cubic with values v0, v1 and slopes d0, d1 at its
+    end."""
+    cubic = _Cubic.of(v0, v1, d0, d1)
+    return 2 * cubic.b + 6 * cubic.c
+
+
 def interpolate(x, h, q0, q1, f0, f1):
     """The cubic at fraction x of a step of length h, from the states at its ends and the fields
     there, for arrays of either executor."""

@@ -15,6 +15,7 @@ from ..._core.results import Result, update_result
 from ...systems.structure import Structure
 from ...systems.transition import SAME_TIME
 from ..arrays import Array, Index, Mask, Times
+from ..cubic import bend_at_end
 from ..events import (
     INSTANT,
     Entry,
@@ -45,6 +46,10 @@ _SHALLOW = 1e5
 # `_SHALLOW`. Higher: rounding errors are computed for more events. Lower: a grazing is missed after
 # a short step.
 _MAY_BE_SHALLOW = 0.1
+# The second derivative of a watched function at its zero is at least this part of its average over
+# the step. Higher: crossings at the end of long steps are called grazing. Lower: a grazing is
+# missed where rounding spoils the second derivative.
+_LEAST_BEND = 0.05
 # The shortest step near t = 0, as a part of the time allowed. Larger: events just before a state
 # would leave all bounds (spikes of a neuron) are missed. Smaller: more steps until a blow-up is
 # reported.
@@ -228,9 +233,15 @@ def _is_shallow(
     length = step_length(aim, new)
     lands = verdict.lands & (length > 0)
     bend = xp.maximum(rate - before, 0.0) / xp.where(lands, length, 1.0)
+    # The second derivative at the zero, which rounding spoils after a short step. Over a long one,
+    # it may be far from its average.
+    values = (of_row(x.value, aim.which) for x in (state.watched, new.watched))
+    at_zero = bend_at_end(*values, length * before, length * rate)
+    at_zero = at_zero / xp.where(lands, length, 1.0) ** 2
+    at_zero = xp.clip(at_zero, _LEAST_BEND * bend, bend)
     touching = of_row(state.touching(task.settings), aim.which)
-    turns_soon = speed < TURN * state.h * bend
-    touches = lands & turns_soon & (speed**2 < 2 * touching * bend)
+    turns_soon = speed < TURN * state.h * at_zero
+    touches = lands & turns_soon & (speed**2 < 2 * touching * at_zero)
     if not s.transitions:
         return touches
     slower = lands & (speed < _MAY_BE_SHALLOW * xp.abs(before))

@@ -15,7 +15,6 @@ from ..._core.executor import namespace
 from ..._core.results import Result
 from ...systems.structure import Structure
 from ..arrays import Array, Index, Inputs, Mask, Padded, Times
-from ..cubic import TOUCH
 from ..lanes import Lanes, Tape
 from ..settings import Settings
 from ..target import Target
@@ -23,10 +22,11 @@ from ..watch import Watch
 
 
 # An extremum is a touch within this many times the error of a step, as a part of the watched
-# function's largest magnitude, and within at most the part `_MOST`. Higher: crossings whose
-# derivatives are right to two digits are called grazing. Lower: derivatives at a touch are made of
-# errors of steps.
-_ERRORS = 100.0
+# function's largest magnitude, and within at least the part `_LEAST`, at most the part `_MOST`.
+# Higher: crossings that steps resolve are called grazing. Lower: derivatives at a touch are made of
+# errors of steps. (Those of `hj.flow`, 1e-12 in each step, are a tenth of `_LEAST`.)
+_ERRORS = 0.1
+_LEAST = 1e-11
 _MOST = 1e-6
 
 
@@ -138,7 +138,7 @@ class State(NamedTuple):
         steps decide whether it crosses zero."""
         xp = namespace(self.aimed)
         assert settings.rtol is not None
-        part = xp.clip(_ERRORS * xp.asarray(settings.rtol), TOUCH, _MOST)
+        part = xp.clip(_ERRORS * xp.asarray(settings.rtol), _LEAST, _MOST)
         return part * self.highest
 
     @property
