@@ -334,7 +334,7 @@ def about_distortion(
     """
     if is_exact(grid, error).all():
         return []
-    kept = grid.inside.any(axis=2)
+    kept = np.asarray(grid.inside.any(axis=2))
     if kept.sum() < _FEWEST_CYCLES:
         return []
     left = np.where(grid.sampled, error, 0.0)
