@@ -361,7 +361,7 @@ def about_distortion(
         return []
     text = (
         "residuals follow products of earlier responses, as nonlinear distortion does: standard "
-        "errors are too small, by a factor of two or more. Push less: errors by distortion fall in "
+        "errors may be too small by a factor of two. Push less: errors by distortion fall in "
         "proportion."
     )
     return [Finding("distortion", text)]
