@@ -6,6 +6,7 @@ import pathlib
 import pickle
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -357,9 +358,24 @@ def test_a_state_of_a_cycle_begins_at_its_time(hopper, cycle):
     assert (pushed.t[0], pushed.after[0, 1]) == (t, 2.0)
     event = path.events[0]
     assert hj.simulate(hopper, event.after, 0.1).t[0] == event.time
-    same = copy.copy(cycle.state), pickle.loads(pickle.dumps(cycle.state))
+    same = (
+        copy.copy(cycle.state),
+        cycle.state.copy(),
+        {"yM": 2.0} | cycle.state,
+        pickle.loads(pickle.dumps(cycle.state)),
+        jax.tree_util.tree_map(lambda x: x + 1e-3, cycle.state),
+        jax.jit(lambda state: state)(cycle.state),
+    )
     for state in same:
         assert hj.simulate(hopper, state, 0.1).t[0] == t
+    numbers, _ = jax.flatten_util.ravel_pytree(cycle.state)
+    assert len(numbers) == len(cycle.state), "the time counts as a state"
+
+
+def test_a_state_of_another_system_does_not_bring_its_time(cycle):
+    field = Field(("yM", "vM"), lambda t, q, u: (q[1], -q[0]))
+    other = toy({"other": field})
+    assert hj.simulate(other, cycle.state, 0.1).t[0] == 0.0
 
 
 def test_a_state_of_a_cycle_has_derivatives(hopper, cycle):

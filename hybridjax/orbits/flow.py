@@ -241,7 +241,8 @@ def flow(
       that ended there. A `Guess` with states (L, n) starts L flows. If only one chart has such
       states, a state (n,) suffices, as numbers or by name. `cycle.state` and the states of an event
       know their chart and time. A `LimitCycle` starts at its `anchor`.
-    - `until`: a time; the name of an event, or `AtEvent(name)`: right after its reset; or a
+    - `until`: a time (no duration: a flow from `event.after` that lasts 0.6 has the end
+      `event.time + 0.6`); the name of an event, or `AtEvent(name)`: right after its reset; or a
       `Crossing`: at its level. `events`: right after so many events, in place of `until`.
     - `within`: the longest duration, required for all ends other than a time. Do not make it much
       longer than the flow: times are rounded to 1e-12 of it, and events fail if it is 1e5 times too

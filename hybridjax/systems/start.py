@@ -83,9 +83,9 @@ def guess_of(
     """
     fitting = [a for a in range(len(s.charts)) if _fits(s, a, state)]
     known = state.as_guess() if isinstance(state, ByName) else None
-    if known is not None:
+    # (A system with other charts may have such states, too.)
+    if known is not None and known.chart in s.names:
         time = known.time if time is None else time
-        # (A system with other charts may have such states, too.)
         fitting = [a for a in fitting if s.names[a] == known.chart] or fitting
     time = 0.0 if time is None else time
     if len(fitting) == 1:

@@ -29,7 +29,7 @@ from .._core import jax_compat
 from .._core.arguments import require_among
 from .._core.call import once_in_call
 from .._core.compilation import identity, kernel
-from .._core.executor import Array, is_hidden
+from .._core.executor import Array, is_hidden, is_traced
 from .._core.lanes import PerLane, by_lane, one_lane, shared
 from .._core.meaning import program_digest
 from .._core.memo import Memory
@@ -160,12 +160,19 @@ class ByName(dict):
         self._time = time
 
     def tree_flatten(self):
-        return (tuple(self.values()), self._time), (tuple(self), self._chart)
+        """The numbers. (Arithmetic with them leaves the time as it is. Only times that JAX traces,
+        or those of many states, have to be a child.)"""
+        values = tuple(self.values())
+        if is_traced(self._time) or np.ndim(self._time):
+            return (values, self._time), (tuple(self), self._chart, None)
+        time = None if self._time is None else float(self._time)
+        return (values, None), (tuple(self), self._chart, time)
 
     @classmethod
     def tree_unflatten(cls, about, children):
-        names, chart = about
-        values, time = children
+        names, chart, time = about
+        values, traced = children
+        time = time if traced is None else traced
         return cls(zip(names, values, strict=True), chart, time)
 
     def with_items(self, items: Mapping[str, Any]) -> "ByName":
@@ -174,6 +181,12 @@ class ByName(dict):
 
     def __or__(self, items: Mapping[str, Any]) -> "ByName":  # type: ignore[override]
         return self.with_items({**self, **items})
+
+    def __ror__(self, items: Mapping[str, Any]) -> "ByName":  # type: ignore[override]
+        return self.with_items({**items, **self})
+
+    def copy(self) -> "ByName":
+        return self.with_items(self)
 
     def as_guess(self) -> Guess | None:
         """Return the state as a start, or `None` where its chart or time is not known."""

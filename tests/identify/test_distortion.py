@@ -67,3 +67,24 @@ def test_noise_of_linear_systems_is_not_called_distortion(process):
         for k in range(40)
     ]
     assert sum("distortion" in x for x in found) <= 2
+
+
+def test_an_exact_output_hides_no_distortion_of_others():
+    """Its residuals are rounding errors, beside which those of the others would be nothing."""
+
+    def with_exact(k, bend):
+        data = series(k, bend, noise=0.02)
+        exact = np.roll(data.u, 1, axis=0)
+        exact[0] = 0.0
+        return dataclasses.replace(
+            data,
+            y=np.concatenate([data.y, exact], axis=1),
+            outputs=("a", "b", "exact"),
+        )
+
+    bent = [causes(hj.fit_series(with_exact(k, 1.0), 1, check=False)) for k in range(5)]
+    right = [
+        causes(hj.fit_series(with_exact(k, 0.0), 1, check=False)) for k in range(5)
+    ]
+    assert all("distortion" in x for x in bent)
+    assert not any("distortion" in x for x in right)

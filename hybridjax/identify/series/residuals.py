@@ -62,6 +62,11 @@ _LEAST_DISTORTION = 0.02
 _PATTERNS = 2
 _SHIFTED_CYCLES = 100
 _FEWEST_CYCLES = 40
+# Share of the products that a shift gives again if inputs repeat. Higher: they seem to explain by
+# chance what they do explain. Lower: too few shifts are left.
+_REPEATED = 0.3
+# Least number of shifts from which the distribution by chance is known.
+_FEWEST_SHIFTS = 15
 # Advice if inputs respond to residuals.
 FOR_WHITE_NOISE = (
     "the fit is biased; name their `references`, or pass noise='innovations'"
@@ -332,11 +337,16 @@ def about_distortion(
 
     **Arguments:** `error`, `predicted` outputs, on `grid`. `c`: the coefficients of chi.
     """
-    if is_exact(grid, error).all():
+    # (Beside residuals that are rounding errors, those of the other outputs would not be seen.)
+    tested = ~is_exact(grid, error)
+    if not tested.any():
         return []
     kept = np.asarray(grid.inside.any(axis=2))
     if kept.sum() < _FEWEST_CYCLES:
         return []
+    grid = grid._replace(sampled=grid.sampled[..., tested])
+    error = error[..., tested]
+    predicted = predicted[..., tested]
     left = np.where(grid.sampled, error, 0.0)
     square = (left**2).sum(axis=(0, 1, 2)) / np.maximum(
         grid.sampled.sum(axis=(0, 1, 2)), 1
@@ -353,6 +363,8 @@ def about_distortion(
     dynamic = _without_sensors(grid, left / noise, response)
     rest = dynamic.reshape(S, T, N * ny) @ patterns
     share, by_chance = _explained(rest[kept], earlier[kept], now[kept])
+    if len(by_chance) < _FEWEST_SHIFTS:
+        return []
     mean = by_chance.mean()
     variance = positive(by_chance.var())
     # (Sums of squares are distributed like a multiple of chi squared.)
@@ -392,7 +404,8 @@ def _explained(
     others: Float[np.ndarray, "cycles K"],
 ) -> tuple[float, Float[np.ndarray, " shifts"]]:
     """Return the share of squares that products explain beyond others, and that which they explain
-    when they are shifted by whole numbers of cycles."""
+    when they are shifted by whole numbers of cycles. (Shifts by which inputs repeat are left out:
+    they give the same products again.)"""
     others = others / positive(np.abs(others).max(axis=0))
     products = products / positive(np.abs(products).max(axis=0))
     known, _ = np.linalg.qr(np.concatenate([np.ones((len(rest), 1)), others], axis=1))
@@ -405,7 +418,12 @@ def _explained(
     def share(shift: int) -> float:
         return float(((np.roll(basis, shift, axis=0).T @ rest) ** 2).sum() / d)
 
-    return share(0), np.array([share(shift) for shift in shifts])
+    def repeats(shift: int) -> bool:
+        overlap = np.roll(basis, shift, axis=0).T @ basis
+        return float((overlap**2).sum() / len(overlap)) > _REPEATED
+
+    by_chance = [share(shift) for shift in shifts if not repeats(shift)]
+    return share(0), np.array(by_chance)
 
 
 def about_answers(
