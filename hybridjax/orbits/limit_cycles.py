@@ -67,7 +67,7 @@ _LOOKED_AT = 50
 # Fewer: a sweep waits for the compiler. More: sweeps without such programs take longer.
 WORTH_COMPILING = 250
 # CPU seconds that small sweeps have spent on searches, by class of systems.
-_searching: collections.Counter = collections.Counter()
+_searching: dict[tuple, float] = collections.defaultdict(float)
 # Number of turns (returns to the section) that are simulated before a search, to find the chart in
 # which the cycle begins. More: hopeless searches last longer. Fewer: cycles that begin in another
 # chart are lost.

@@ -235,8 +235,9 @@ def _is_shallow(
     bend = xp.maximum(rate - before, 0.0) / xp.where(lands, length, 1.0)
     # The second derivative at the zero, which rounding spoils after a short step. Over a long one,
     # it may be far from its average.
-    values = (of_row(x.value, aim.which) for x in (state.watched, new.watched))
-    at_zero = bend_at_end(*values, length * before, length * rate)
+    begin = of_row(state.watched.value, aim.which)
+    end = of_row(new.watched.value, aim.which)
+    at_zero = bend_at_end(begin, end, length * before, length * rate)
     at_zero = at_zero / xp.where(lands, length, 1.0) ** 2
     at_zero = xp.clip(at_zero, _LEAST_BEND * bend, bend)
     touching = of_row(state.touching(task.settings), aim.which)
