@@ -9,7 +9,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, dataclass_transform
 
 import equinox as eqx
 
@@ -36,6 +36,8 @@ def missing_attribute(self: Any, name: str) -> Any:
     raise UnknownAttribute(about)
 
 
+# (Checkers of types would not know that equinox makes dataclasses.)
+@dataclass_transform(field_specifiers=(dataclasses.field, eqx.field))
 class Leading(type(eqx.Module)):  # type: ignore[misc]  # (It has no public name.)
     """The class of classes whose missing constructors lead on, such as `Recording.from_csv`."""
 

@@ -55,7 +55,7 @@ _ALONE = 4.0
 # part of their squares. Larger level, smaller part: right fits get a finding. Smaller level, larger
 # part: distortion passes, and standard errors are too small.
 _DISTORTED = 3e-3
-_LEAST_DISTORTION = 0.02
+_LEAST_DISTORTION = 0.12
 # The largest number of patterns of a cycle of which products are taken, the number of shifts that
 # are compared, and the fewest cycles. More patterns: slow responses are lost among others. Fewer
 # shifts or cycles: the level is not held.
