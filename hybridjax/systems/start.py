@@ -100,15 +100,17 @@ def guess_of(
             f"the charts {names} have such states: say in which one {called} is, as "
             f"`hj.Guess('{s.names[fitting[0]]}', state)`."
         )
+    raise DefinitionError(_no_such_states(s, state, called))
+
+
+def _no_such_states(s: Structure, state: StateLike, called: str) -> str:
     charts = "; ".join(
         f"'{name}' has {', '.join(chart.states)}"
         for name, chart in zip(s.names, s.charts, strict=True)
     )
     by_name = isinstance(state, Mapping)
     given = f"the states {', '.join(state)}" if by_name else f"{len(state)} numbers"
-    raise DefinitionError(
-        f"{called} has {given}, which are the states of no chart: {charts}."
-    )
+    return f"{called} has {given}, which are the states of no chart: {charts}."
 
 
 def own_guess(system: HybridSystem) -> Guess:
