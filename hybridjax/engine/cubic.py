@@ -95,13 +95,13 @@ def first_crossing(
     was_positive = armed & (v0 > 0)
 
     def touches(node, value):
-        bend = 2 * cubic.b + 6 * cubic.c * node
         is_small = xp.abs(value) + _beside(node, margin) <= touching
-        return is_small & (2 * xp.abs(value) <= bend * turn**2)
+        turns_soon = 2 * xp.abs(value) <= cubic.bend(node) * turn**2
+        return is_small & turns_soon
 
     # An extremum at the end of the step itself.
-    at_end = was_positive & (d1**2 <= 2 * (2 * cubic.b + 6 * cubic.c) * touching)
-    touch = touch | (at_end & touches(1.0, v1))
+    is_extremum = d1**2 <= 2 * cubic.bend(1.0) * touching
+    touch = touch | (was_positive & is_extremum & touches(1.0, v1))
     for node, value, before in ((sa, va, was_positive), (sb, vb, va > 0)):
         is_minimum = cubic.b + 3 * cubic.c * node > 0
         dips = before & (node < 1) & is_minimum
@@ -142,6 +142,10 @@ class _Cubic(NamedTuple):
     def slope(self, s):
         return self.d0 + s * (2 * self.b + s * 3 * self.c)
 
+    def bend(self, s):
+        """The second derivative."""
+        return 2 * self.b + 6 * self.c * s
+
     def extrema(self) -> tuple[Array, Array]:
         """Positions of the two extrema within (0, 1), in order; 1 in place of an extremum outside
         of (0, 1).
@@ -151,8 +155,9 @@ class _Cubic(NamedTuple):
         _, d0, b, c = self
         xp = namespace(b)
         disc = b * b - 3 * c * d0
+        root = xp.sqrt(xp.maximum(disc, 0.0))
         sign = xp.where(b < 0, -1.0, 1.0)
-        pivot = -(b + sign * xp.sqrt(xp.maximum(disc, 0.0)))
+        pivot = -(b + sign * root)
         r1 = _divide(pivot, 3 * c)
         r2 = _divide(d0, pivot)
         has_first = (disc > 0) & (r1 > 0) & (r1 < 1)
@@ -191,8 +196,7 @@ def dips(v0, v1, d0, d1) -> Flags:
 def bend_at_end(v0, v1, d0, d1) -> Float[Array, "*shape"]:
     """The second derivative, per step, of the cubic with values v0, v1 and slopes d0, d1 at its
     end."""
-    cubic = _Cubic.of(v0, v1, d0, d1)
-    return 2 * cubic.b + 6 * cubic.c
+    return _Cubic.of(v0, v1, d0, d1).bend(1.0)
 
 
 def interpolate(x, h, q0, q1, f0, f1):

@@ -150,8 +150,8 @@ def _index(what: str, name: str, names: Sequence[str]) -> int:
 class ByName(dict):
     """Numbers by names. An error for another name lists them. A pytree, as dictionaries are.
 
-    **Arguments:** `chart`, `time`: where and when the numbers are a state. (Else who starts there
-    would start at time 0, and leave the cycle of a system with a clock.)
+    **Arguments:** `chart`, `time`: those of the state whose numbers these are. A simulation from
+    the state begins there. (At time 0 instead, it would leave the cycle of a system with a clock.)
     """
 
     def __init__(self, values: Any, chart: str | None = None, time: Any = None):

@@ -127,8 +127,9 @@ class SeriesFit(MultiplierFit):
     - `findings`: "drift" if a fit to the first 1000 cycles, in which outputs may drift, has other
       multipliers (outside of each other's confidence regions); "order" if a fit with one or two
       multipliers more contradicts this fit in the same way; "feedback" if inputs depend on earlier
-      residuals, as with a controller, so that the fit is biased; "changing system" if the
-      multipliers of earlier and later cycles differ; "undetermined"; "no convergence".
+      residuals, as with a controller, so that the fit is biased; "distortion" if residuals follow
+      products of earlier responses, so that standard errors may be too small; "changing system" if
+      the multipliers of earlier and later cycles differ; "undetermined"; "no convergence".
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]

@@ -13,8 +13,8 @@ _OF_OUTPUT = (
 )
 
 _OF_SAMPLES = (
-    "`hj.fitting.ObservedTrajectory(hj.Guess(chart, state), times, outputs, values)` makes one of "
-    "the samples of a recording"
+    "`hj.fitting.ObservedTrajectory(hj.Guess(chart, state), times, outputs, values, input=push)` "
+    "makes one of the samples of a recording"
 )
 
 MAKERS = {
