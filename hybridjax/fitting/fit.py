@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from .._core.arguments import searching
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Seed
-from .._core.findings import warn_of
+from .._core.findings import listed, warn_of
 from .._core.memo import Recent
 from .._core.progress import counted, working
 from .._core.results import Result
@@ -46,7 +46,7 @@ from .problem import (
     free_parameters,
     tail_of,
 )
-from .transients import ObservedTrajectory, require_names
+from .transients import ObservedTrajectory, lack_of, require_names
 
 
 Data = AbstractObservation | Sequence[AbstractObservation]
@@ -200,10 +200,17 @@ def _fit_transients(problem: TransientProblem, guesses: int, seed: int) -> Model
             break
     best = min(ends, key=lambda end: end.cost)
     if not np.isfinite(best.cost):
+        lacks = [
+            lack_of(x, problem.system)
+            for x in problem.observations
+            if isinstance(x, ObservedTrajectory)
+        ]
+        causes = [f"trajectory {k}: {x}" for k, x in enumerate(lacks, 1) if x]
+        causes = causes or ["derivatives are not finite"]
         raise ComputationError(
-            f"none of {guesses} guesses has trajectories with all measurements: one ends sooner or "
-            "lacks a measured event. Compare `hj.flow` from the start of each with its data, and "
-            "begin with other parameters."
+            f"none of {guesses} guesses has trajectories with all measurements. With the "
+            f"parameters of `system`: {listed(causes)}. Compare `hj.flow` from the start of each "
+            "with its data, and begin with other parameters."
         )
     return _of_end(problem, ends, best, None)
 

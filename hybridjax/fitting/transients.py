@@ -18,13 +18,14 @@ from .._core.arguments import Numbers, require_axes
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import OptionalNames, PositiveScalar
 from .._core.boundary.values import Reals
+from .._core.results import Result
 from .._core.text import fields
 from ..engine.flow import Samples
 from ..engine.lanes import Lanes, pace_of
 from ..engine.settings import Settings
 from ..errors import DefinitionError
 from ..orbits.cycle import LimitCycle
-from ..orbits.flow import MOST_STEPS, Flow, requested, sampled
+from ..orbits.flow import Flow, requested, sampled
 from ..sections.placed import observe
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem
@@ -173,6 +174,23 @@ def residuals_of(
     return jnp.concatenate(parts)
 
 
+def lack_of(observation: ObservedTrajectory, system: HybridSystem) -> str:
+    """Why the flow of a system lacks measurements; empty if it has all."""
+    if np.isfinite(residuals_of(observation, system)).all():
+        return ""
+    found, _ = sampled(_request(observation, system), observation.times)
+    result = Result(int(found.result))
+    if result == Result.OK:
+        return "it lacks a measured event"
+    more = ""
+    if result == Result.STEP_LIMIT:
+        more = (
+            " (kinks of an `input` need many steps: pass a smoother one, or `settings` with larger "
+            "`rtol`, `atol` and `max_steps` to `ObservedTrajectory`)"
+        )
+    return f"{result.message}{more}"
+
+
 def _request(observation: ObservedTrajectory, system: HybridSystem) -> Any:
     """The flow until a little after the last measurement."""
     times = observation.times, *observation.event_times
@@ -189,7 +207,7 @@ def _request(observation: ObservedTrajectory, system: HybridSystem) -> Any:
         input=observation.input,
         settings=observation.settings,
         max_events=count + _MORE_EVENTS,
-        max_steps=MOST_STEPS,
+        max_steps=None,
     )
 
 

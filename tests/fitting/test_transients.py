@@ -202,5 +202,32 @@ def test_bad_fits():
     late = hj.fitting.ObservedTrajectory(
         hj.Guess("main", (1.0, 0.0)), events={"bounce": (0.01, 0.02, 0.03)}
     )
-    with pytest.raises(ComputationError, match="lacks a measured event"):
+    with pytest.raises(ComputationError, match="trajectory 1: it lacks a measured ev"):
         hj.fit_model(ball(), late, "e")
+
+
+def test_a_push_with_kinks_needs_more_steps_and_the_error_says_so():
+    """The parameter of an oscillator that was pushed, from the samples of a recording."""
+    oscillator = hj.models.VanDerPol(mu=1.0)
+    times = np.linspace(0.0, 6.0, 301)
+    rng = np.random.default_rng(0)
+    kicks = jnp.asarray(0.3 * rng.normal(size=len(times)))
+
+    def push(t):
+        return jnp.interp(t, times, kicks)[None]
+
+    start = hj.Guess("oscillation", (2.0, 0.0))
+    coarse = hj.orbits.Settings(rtol=1e-8, atol=1e-8, max_steps=8192)
+    path = hj.flow(oscillator, start, 6.0, input=push, settings=coarse)
+    values = np.asarray(path.at(times)[1])
+
+    def samples(settings):
+        return hj.fitting.ObservedTrajectory(
+            start, times, ("x", "v"), values, input=push, settings=settings
+        )
+
+    other = hj.models.VanDerPol(mu=0.8)
+    with pytest.raises(ComputationError, match="limit on steps .*larger `rtol`"):
+        hj.fit_model(other, samples(None), "mu")
+    fit = hj.fit_model(other, samples(coarse), "mu")
+    assert float(fit.system.mu) == pytest.approx(1.0, abs=1e-5)
