@@ -113,9 +113,11 @@ def _passed(
 @_passed.def_jvp
 def _passed_jvp(primals, tangents):
     s, lanes, u, target, times, settings, options, most_events, result = primals
-    still = fixed((s, lanes, u, target))
+    still_s, still_lanes, still_u, still_target = fixed((s, lanes, u, target))
     with_tangents = options._replace(tangents=True)
-    moved, tape = _recorded(*still, settings, with_tangents, result)
+    moved, tape = _recorded(
+        still_s, still_lanes, still_u, still_target, settings, with_tangents, result
+    )
     target, levels = target.split()
 
     def repeat(by_lane, common):

@@ -166,7 +166,8 @@ def flow_batch(
         if not course.has_event_sections:
             return result
         at_event = (result == Result.OK) & (course.bound.event[section] >= 0)
-        missed = followed_at_once(*fixed((s, lanes, u)), at_event, period)
+        still_s, still_lanes, still_u = fixed((s, lanes, u))
+        missed = followed_at_once(still_s, still_lanes, still_u, at_event, period)
         return update_result(result, missed >= 0, Result.EVENT_ORDER)
 
     @jax.checkpoint

@@ -140,7 +140,8 @@ class Branch(Showable, eqx.Module):
         if self.cycles.conserved:
             return np.array([cycle.stable for cycle in self._each])
         # (By the product of the factors: its rounding errors are small compared to 1.)
-        return (np.abs(self.cycles.multipliers) < 1).all(axis=1)
+        within = np.abs(self.cycles.multipliers) < 1
+        return np.array([each.all() for each in within])
 
     def largest(self, output: str) -> Float[np.ndarray, " K"]:
         """The largest value of a state or output on each cycle, as accurate as a plot needs.

@@ -578,7 +578,8 @@ def _eigenvalues(jacobian: _Jacobian) -> _Eigenvalues:
     from scipy import linalg  # (a fifth of a second)
 
     J = jacobian.value
-    values, left, right = linalg.eig(J, left=True, right=True)
+    solution: Any = linalg.eig(J, left=True, right=True)
+    values, left, right = solution
     product = np.einsum("ij,ij->j", left.conj(), right)
     # (The product is 0 for eigenvalues that coincide.)
     with np.errstate(all="ignore"):
@@ -665,7 +666,7 @@ def _bound(
 ) -> float:
     """Return a bound of the eigenvalues that are not listed: 97.5 % of draws have all their
     eigenvalues below it, after projection on the rest of the space."""
-    rest = np.eye(len(projection)) - projection.real
+    rest = np.eye(len(projection)) - np.real(projection)
     others = np.linalg.eigvals(rest @ drawn @ rest)
     largest = np.abs(others).max(axis=1, initial=0)
     return float(np.quantile(largest, 0.975))

@@ -193,9 +193,9 @@ class NaturalMultipliers(WithMultipliers, eqx.Module):
         reach = wider * quantile
         values = self.plain if plain else self.multipliers
         draws = self.plain_draws if plain else self.draws
-        is_real = values.imag == 0
-        center = np.where(is_real, values.real, np.abs(values))
-        drawn = np.where(is_real, draws.real, _moduli(values, draws))
+        is_real = np.imag(values) == 0
+        center = np.where(is_real, np.real(values), np.abs(values))
+        drawn = np.where(is_real, np.real(draws), _moduli(values, draws))
         half = reach * drawn.std(axis=0)
         pair = np.stack([center - half, center + half], axis=1)
         ends = np.abs(pair)
@@ -232,9 +232,9 @@ def _covariances(
         if z.imag:
             mirrored = draws[:, conjugate_of(values, k)].conj()
             both = np.concatenate([drawn, mirrored])
-            covariances[k] = np.cov(both.real, both.imag)
+            covariances[k] = np.cov(np.real(both), np.imag(both))
         else:
-            covariances[k, 0, 0] = drawn.real.var()
+            covariances[k, 0, 0] = np.real(drawn).var()
     return covariances
 
 
@@ -245,7 +245,7 @@ def _moduli(
     the product of the two draws, since these may be two real numbers, one larger and one smaller
     than the modulus."""
     moduli = np.abs(draws)
-    for k in np.flatnonzero(values.imag > 0).tolist():
+    for k in np.flatnonzero(np.imag(values) > 0).tolist():
         twin = conjugate_of(values, k)
         square = moduli[:, k] * moduli[:, twin]
         common = np.sqrt(square)

@@ -9,7 +9,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable
-from typing import Any, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 
@@ -36,9 +36,7 @@ def missing_attribute(self: Any, name: str) -> Any:
     raise UnknownAttribute(about)
 
 
-# (Checkers of types would not know that equinox makes dataclasses.)
-@dataclass_transform(field_specifiers=(dataclasses.field, eqx.field))
-class Leading(type(eqx.Module)):  # type: ignore[misc]  # (It has no public name.)
+class _Leading(type(eqx.Module)):  # type: ignore[misc]  # (It has no public name.)
     """The class of classes whose missing constructors lead on, such as `Recording.from_csv`."""
 
     def __getattr__(cls, name: str) -> Any:
@@ -48,6 +46,14 @@ class Leading(type(eqx.Module)):  # type: ignore[misc]  # (It has no public name
                 f"type object {cls.__name__!r} has no attribute {name!r}"
             )
         raise UnknownAttribute(functools.partial(leads.about_attribute, cls, name))
+
+
+if TYPE_CHECKING:
+    # (This class tells checkers of types that modules are dataclasses; they do not pass it on to
+    # the classes that are made of it.)
+    from equinox._module._module import _ModuleMeta as Leading
+else:
+    Leading = _Leading
 
 
 def leading_on(cls: Class) -> Class:

@@ -266,10 +266,10 @@ class PopulationMaps:
         reach = np.quantile(largest, 0.95, method="higher") * error
         grid = parts[0].shape[1:]
         return MapResult(
-            values=value.reshape(grid),
+            values=np.reshape(value, grid),
             each=parts[0] if len(parts) == 1 else parts[0][:0],
-            reach=reach.reshape(grid),
-            t=t.reshape(grid),
+            reach=np.reshape(reach, grid),
+            t=np.reshape(t, grid),
             p=(above / len(largest)).reshape(grid),
             significant=(np.abs(value) > reach).reshape(grid),
             axes=self.axes,
@@ -366,7 +366,7 @@ def _are_skewed(parts: list[Maps], level: float, rng: np.random.Generator) -> bo
     rotated = np.zeros(_ROTATIONS)
     for part in parts:
         n = len(part)
-        values = np.concatenate([part.real, part.imag], axis=1)
+        values = np.concatenate([np.real(part), np.imag(part)], axis=1)
         # Deviations from a mean have n - 1 dimensions.
         basis, _ = np.linalg.qr(np.eye(n) - 1 / n)
         contrasts = basis[:, : n - 1]
