@@ -72,12 +72,12 @@ def names():
 RUN = """
 hj.simulate(hopper, hopper.guess(), 0.5)
 hopper.replace(k=9.0)
-cycle.stable
+cycle.is_stable
 cycle.modulus
 cycle.findings
 cycle.plot()
 cycle.to_pandas()
-model.stable
+model.is_stable
 model.simulate(np.zeros(16))
 model.plot()
 model.to_pandas()
@@ -193,7 +193,10 @@ hj.validate(data, model)                                -> wrong order
 hj.save(fit, "fit.npz")                                 -> wrong order
 hj.save("cycle.npz", cycle)                             -> cycle.to_pandas()
 cycle.T                                                 -> `period`
-cycle.is_stable                                         -> `stable`
+cycle.stable                                            -> is `is_stable`
+model.stable                                            -> is `is_stable`
+cycle.stability                                         -> use `is_stable`
+hj.continuation(cycle, "k", (9.9, 10.1), step=1.0).is_stable -> use `stable`
 cycle.eigenvalues                                       -> `multipliers`
 cycle.trajectories                                      -> `trajectory`
 model.poles                                             -> `multipliers`

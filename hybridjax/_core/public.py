@@ -78,6 +78,8 @@ _WORDS = {
     "HTF.f": "frequencies",
     "HTF.scatter": "variance_dof",
     "Identification.advice": "diagnosis",
+    "LDTP.stable": "is_stable",
+    "LimitCycle.stable": "is_stable",
     "Limits.strides": "cycles",
     "MultiplierGoal.overhang": "extra_lags",
     "OptimalDesign.strides": "cycles",

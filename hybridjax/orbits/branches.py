@@ -138,7 +138,7 @@ class Branch(Showable, eqx.Module):
     def stable(self) -> Bool[np.ndarray, " K"]:
         """True for each stable cycle. At a marked point itself rounding decides."""
         if self.cycles.conserved:
-            return np.array([cycle.stable for cycle in self._each])
+            return np.array([cycle.is_stable for cycle in self._each])
         # (By the product of the factors: its rounding errors are small compared to 1.)
         within = np.abs(self.cycles.multipliers) < 1
         return np.array([each.all() for each in within])

@@ -109,7 +109,7 @@ NAMES = {
         "use `hj.run_experiments(cycle, sections, design, outputs)`": (
             "run experiment perturb collect"
         ),
-        "use `hj.find_limit_cycle(system).stable`": "stability stable is_stable",
+        "use `hj.find_limit_cycle(system).is_stable`": "stability stable is_stable",
         "use `model.simulate(np.ones((n, nu)))`": (
             "step_response step_info step dstep"
         ),

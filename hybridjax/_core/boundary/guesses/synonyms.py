@@ -66,7 +66,7 @@ WORDS = {
     "size": ("n_sections", "experiments"),
     "solver": ("settings", "solver"),
     "spectral_radius": ("modulus", "multipliers"),
-    "stable": ("stable",),
+    "stable": ("is_stable", "stable"),
     "standard_errors": ("standard_errors", "standard_error", "std"),
     "state": ("state", "states", "anchor", "guess"),
     "step": ("settings", "step"),
