@@ -140,6 +140,7 @@ hj.simulate(hopper, duration=0.5)
 hj.flow(hopper, cycle, 0.5)["yM"]
 hj.sweep(hopper, k=10.0)
 hj.continuation(cycle, k=(9.99, 10.01))
+hj.continuation(cycle, k=(9.99, 10.01)).bifurcations
 hj.linearize(cycle, "touchdown").multipliers
 hj.identify_recording(rec.to_pandas(), apex, "u", "yM", n_sections=8, order=2)
 hj.Recording(rec.to_pandas())
@@ -293,7 +294,9 @@ model.observability()                                   -> to_control
 hj.read_sbml("x.xml")                                   -> from_functions
 hj.SINDy()                                              -> hj.fit_model
 hj.models.Lorenz()                                      -> from_functions
-hj.period_doubling(cycle)                               -> branch.points
+hj.period_doubling(cycle)                               -> branch.bifurcations
+hj.continuation(cycle, "k", (9.9, 10.1), step=1.0).points -> is `bifurcations`
+hj.orbits.BranchPoint                                   -> hj.orbits.Bifurcation
 hj.continuation(cycle, "k", bounds=(8, 12))             -> use `range`
 hj.continuation(cycle, "k", (8, 12), NMX=100)           -> `max_points`
 hj.continuation(cycle, "k", (8, 12), ICP=1)             -> its range by its name

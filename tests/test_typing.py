@@ -190,9 +190,9 @@ UNCHECKED = {
     },
     "made by this package": {
         "Arrival",
+        "Bifurcation",
         "Branch",
         "BranchEnd",
-        "BranchPoint",
         "Constrained",
         "Coupling",
         "Diagnosis",

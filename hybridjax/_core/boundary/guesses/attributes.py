@@ -413,7 +413,7 @@ ATTRIBUTES = {
         "`trajectory.t[-1]` is the last time": "t1 tf end duration t_final",
     },
     "Branch": {
-        "`branch.points` has them": "bifurcations special_points hopf folds",
+        "`branch.bifurcations` has them": "hopf folds flips",
     },
     "Population": {
         "`population.difference(quantity, a, b)` tests a difference, with p values": (

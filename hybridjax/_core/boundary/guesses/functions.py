@@ -190,7 +190,7 @@ NAMES = {
         "use `hj.continuation(cycle, parameter, (low, high))`": (
             "bifurcation bifurcation_diagram continue_cycle branch auto follow"
         ),
-        "use `branch.points`, of `hj.continuation(cycle, parameter, (low, high))`": (
+        "use `branch.bifurcations`, of `hj.continuation(cycle, parameter, (low, high))`": (
             "hopf hopf_points period_doubling fold limit_point neimark_sacker bifurcation_points"
         ),
         "equations are written as fields: `hj.HybridSystem.from_functions(states, field, "
