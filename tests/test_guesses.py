@@ -97,6 +97,7 @@ rec["yM"]
 rec.plot()
 rec.rate
 rec.duration
+rec.crop(10, 50).duration
 rec.time
 len(rec)
 fit.contains(cycle)
@@ -209,6 +210,9 @@ fit.save("fit.npz")                                     -> hj.save(path, result)
 rat.interval()                                          -> hj.fit_multipliers
 rec.ch_names                                            -> `signals`
 rec.sfreq                                               -> `rate`
+rec.truncate(before=10)                                  -> recording.crop(start, stop)
+hj.identify_recording(rec, apex, tmin=10)                -> recording.crop(start, stop)
+rec.crop(tmin=10)                                       -> recording.crop(start, stop)
 rec.pick("yM")                                          -> recording[name]
 est.plot().savefig("bode.png")                          -> plot.save(path)
 hopper.stiffness                                        -> `k`

@@ -376,6 +376,7 @@ def recordings(t):
     rises = hj.Crossing("x", "rising")
     angle = hj.KinematicPhase(4, position="x", velocity="v")
     yield t.recording.mark, dict(event="e", crossing=rises)
+    yield t.recording.crop, dict(start=0.0, stop=1.0)
     for name in ("column", "samples", "unit", "__getitem__"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, sections=angle)

@@ -276,9 +276,12 @@ ATTRIBUTES = {
     "Recording": {
         "`hj.Recording(time[part], {name: recording[name][part]})` makes a recording of some "
         "signals or samples": (
-            "crop iloc loc drop_channels rename rename_channels drop pick_types reorder_channels "
-            "set_index select slice truncate cut split rename_signals add_channels set_units "
-            "pick_channels add_signal append_signal assign"
+            "drop_channels rename rename_channels drop pick_types reorder_channels set_index "
+            "select rename_signals add_channels set_units pick_channels add_signal append_signal "
+            "assign"
+        ),
+        "`recording.crop(start, stop)` returns the part between two times": (
+            "iloc loc slice truncate cut split trim between sel part"
         ),
         "`recording[name]` has the samples of a signal, `recording.to_pandas()` all signals": (
             "data get_data values x samples_array to_numpy"
