@@ -227,8 +227,6 @@ OBJECTS = {
     "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
     "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
     "save.NaturalIdentification": "save its `fit`, or write `result.write_report(folder)`",
-    "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
-    "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
     "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
 }
