@@ -91,6 +91,12 @@ est.plot(outputs="yM")
 hj.plot.bode([est, model.htf(est.frequencies)])
 est.plot().save("bode.pdf")
 est.standard_errors
+est["yM"].plot()
+abs(est["yM"].H)
+est["yM"][0]
+est.select(0, outputs="yM", inputs="u")
+est.magnitude
+est.phase
 traj.plot()
 traj.to_pandas()
 rec["yM"]
@@ -209,7 +215,6 @@ hj.continuation(cycle, "k", (9.9, 10.1), step=1.0).is_stable -> use `stable`
 cycle.eigenvalues                                       -> `multipliers`
 cycle.trajectories                                      -> `trajectory`
 model.poles                                             -> `multipliers`
-est.phase                                               -> np.angle
 fit.standard_error                                      -> `standard_errors`
 fit.conf_int()                                          -> `interval`
 fit.coef_                                               -> `coefficients`
@@ -298,7 +303,7 @@ hj.HybridSystem()                                       -> hj.HybridSystem.from_
 hj.Guess("flight", {"yM": 2.0})                         -> in the order of the chart's states
 est.zeros()                                             -> fit_rational(htf)
 est.freqresp([0.1])                                     -> `htf.frequencies`
-est.dcgain()                                            -> abs(htf.H)
+est.dcgain()                                            -> htf.magnitude
 cycle.amplitude                                         -> np.ptp(
 cycle.eigenvectors                                      -> model.monodromy()
 model.observability()                                   -> to_control
@@ -414,8 +419,9 @@ hj.HybridSystem(modes={}, guards={}, resets={})         -> [(name, guard, reset)
 hj.HybridSystem.from_sympy("x")                         -> hj.HybridSystem.from_functions
 hj.models.RelayFeedback()                               -> hj.HybridSystem.from_functions
 model.discretize()                                      -> model.A[k]
-est["yM"]                                               -> htf.H[:, :, htf.outputs.index('y')]
-est.select("yM")                                        -> htf.plot(outputs='y')
+est["YM"]                                               -> use 'yM'
+est.select("yM")                                        -> htf.select(outputs='y')
+est.output("yM")                                        -> `htf['y']`
 design.n_realizations                                   -> of all realizations together
 ser.residuals                                           -> validation.measured
 hj.fit_series(data, order=(1, 2, 3))                    -> hj.select_order(data)

@@ -208,7 +208,7 @@ def transfer_functions(t):
     yield t.estimate.require_sampled, dict(name="a fit")
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
-    yield htf.select, dict(harmonics=0)
+    yield htf.select, dict(harmonics=0, outputs=None, inputs=None)
     yield htf.predict, dict(u=np.ones((12, 2)))
     for name in ("error", "harmonic_errors"):
         yield getattr(htf, name), dict(other=t.exact)

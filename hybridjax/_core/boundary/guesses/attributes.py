@@ -134,12 +134,11 @@ ATTRIBUTES = {
         "`htf.variance` and `htf.standard_errors` have the errors": (
             "coherence coh mscohere"
         ),
-        "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it": (
-            "magnitude gain mag db dcgain"
+        "`htf.magnitude` has it, and `hj.plot.bode(htf)` draws it": (
+            "gain mag db dcgain"
         ),
-        "`np.angle(htf.H)` has it, and `hj.plot.bode(htf)` draws it": "phase angle",
-        "`htf.H[:, :, htf.outputs.index('y')]` has those of an output, and "
-        "`htf.plot(outputs='y')` draws them": "output get_output sel_output",
+        "`htf.phase` has it in radians, and `hj.plot.bode(htf)` draws it": "angle",
+        "`htf['y']` is the HTF of an output": "output get_output sel_output",
         "`htf.select(0)` is the HTF of one harmonic, and `htf[0]` its values": (
             "harmonic eval evaluate evalfr at loc iloc sel isel"
         ),

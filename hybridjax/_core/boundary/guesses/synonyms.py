@@ -35,7 +35,7 @@ WORDS = {
     "guess": ("guess", "initial", "state"),
     "harmonic": ("harmonics", "harmonic"),
     "input": ("inputs", "input", "u"),
-    "magnitude": ("H", "modulus"),
+    "magnitude": ("magnitude", "H", "modulus"),
     "max_iter": ("settings", "max_steps"),
     "modulus": ("modulus", "multipliers"),
     "n": ("n_sections", "order"),
