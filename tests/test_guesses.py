@@ -108,7 +108,7 @@ rec.time
 len(rec)
 fit.contains(cycle)
 fit.compare(ser).p_value
-hj.validate(fit, data)
+hj.validate(fit, data).residuals
 hj.validate(phys, data).plot()
 hj.select_order(est).plot()
 hj.optimal_design(model, noise=1e-4).plot()
@@ -423,7 +423,9 @@ est["YM"]                                               -> use 'yM'
 est.select("yM")                                        -> htf.select(outputs='y')
 est.output("yM")                                        -> `htf['y']`
 design.n_realizations                                   -> of all realizations together
-ser.residuals                                           -> validation.measured
+ser.residuals                                           -> validation.residuals
+hj.validate(fit, data).resid                            -> use `residuals`
+result.residuals                                        -> validation.residuals
 hj.fit_series(data, order=(1, 2, 3))                    -> hj.select_order(data)
 hj.fit_multipliers(est, range(1, 4))                    -> hj.select_order(htf)
 hj.fit_model(hopper, rec, {"k": 20.0})                  -> ObservedTrajectory(hj.Guess(
@@ -726,10 +728,9 @@ def test_what_leads_name_runs(names):
     """The calls of sentences that other tests hold only by their words."""
     ser, data, est = names["ser"], names["data"], names["est"]
     validation = hj.validate(ser, data)
-    residuals = validation.measured - validation.simulated
+    residuals = validation.residuals
     assert 0 < np.abs(residuals).max() < np.abs(data.y).max()
-    of_output = est.H[:, :, est.outputs.index("yM")]
-    assert_array_equal(of_output, np.asarray(est.H)[:, :, 0])
+    assert_array_equal(est["yM"].H, est.select(outputs="yM").H)
     assert est.plot(outputs="yM").axes.size
     groups = {"subject": list("abcd"), "group": list("xxyy")}
     people = hj.recordings.Population.from_fits([names["result"]] * 4, groups)

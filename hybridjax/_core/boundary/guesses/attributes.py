@@ -352,7 +352,8 @@ ATTRIBUTES = {
         ),
         "`result.fit` is the fit": "model params coef",
         "`hj.validate(result, data)` compares it with data, and `result.fit.htf(frequencies)` is "
-        "its response": "predict simulate residuals",
+        "its response": "predict simulate",
+        RESIDUALS: "residuals resid",
         "`hj.save(path, result.fit)` writes the fit, and `result.write_report(folder)` all": (
             "save export to_file dump"
         ),
@@ -363,9 +364,6 @@ ATTRIBUTES = {
         ),
         "`validation.whiteness` and `validation.independence` have the p values": (
             "pvalue ljung_box"
-        ),
-        "residuals are `validation.measured - validation.simulated`": (
-            "residuals resid"
         ),
     },
     "OrderSelection": {
