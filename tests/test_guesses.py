@@ -424,6 +424,9 @@ est.select("yM")                                        -> htf.select(outputs='y
 est.output("yM")                                        -> `htf['y']`
 design.n_realizations                                   -> of all realizations together
 ser.residuals                                           -> validation.residuals
+result.bode()                                           -> hj.plot.bode(result)
+fit.bode()                                              -> hj.plot.bode(htf, fit)
+model.bode()                                            -> hj.plot.bode(model)
 hj.validate(fit, data).resid                            -> use `residuals`
 result.residuals                                        -> validation.residuals
 hj.fit_series(data, order=(1, 2, 3))                    -> hj.select_order(data)

@@ -114,6 +114,7 @@ ATTRIBUTES = {
         ),
         "`fit.multipliers` and `fit.coefficients` have the numbers, and a function makes a new "
         "fit": "get_params set_params",
+        "`hj.plot.bode(htf, fit)` draws it over an HTF": "bode bode_plot nyquist",
         "a fit is made in one go, with the numbers in `fit.chi2_per_dof`": (
             "n_iter nfev n_iterations history"
         ),
@@ -183,9 +184,8 @@ ATTRIBUTES = {
         ),
     },
     "LDTP": {
-        "`hj.plot.bode(model.htf(frequencies))` draws it": (
-            "bode nyquist freqresp bode_plot frequency_response"
-        ),
+        "`hj.plot.bode(model)` draws it": "bode nyquist bode_plot",
+        "`model.htf(frequencies)` is the response": "freqresp frequency_response",
         "a model has `n_sections` samples in a period; time is not part of it": (
             "dt fs ts"
         ),
@@ -346,7 +346,8 @@ ATTRIBUTES = {
         "durations": (
             "n_strides strides n_cycles cycles stride_time periods n_trials cadence step_times"
         ),
-        "`result.fit.htf(frequencies)` is the HTF": "htf bode transfer_function",
+        "`result.fit.htf(frequencies)` is the HTF": "htf transfer_function",
+        "`hj.plot.bode(result)` draws it": "bode bode_plot nyquist",
         "`result.held_out.validation` compares a fit with held-out cycles": (
             "validation score r2 rsquared rmse goodness cross_validation"
         ),
