@@ -306,11 +306,11 @@ def known(case: Case, branch: Branch) -> list[str]:
         if abs(end.value - border) > case.within * abs(border):
             found.append(f"end at {end.value:.8g}, not {border:.8g}")
     if case.marks is not None:
-        kinds = [point.kind for point in branch.points]
+        kinds = [point.kind for point in branch.bifurcations]
         if kinds != [kind for kind, _ in case.marks]:
             found.append(f"marked points {kinds}, not {case.marks}")
         else:
-            for point, (kind, value) in zip(branch.points, case.marks, strict=True):
+            for point, (kind, value) in zip(branch.bifurcations, case.marks, strict=True):
                 if abs(point.value - value) > case.within * abs(value):
                     found.append(f"{kind} at {point.value:.10g}, not {value:.10g}")
     if case.exact is not None:

@@ -72,12 +72,12 @@ def names():
 RUN = """
 hj.simulate(hopper, hopper.guess(), 0.5)
 hopper.replace(k=9.0)
-cycle.stable
+cycle.is_stable
 cycle.modulus
 cycle.findings
 cycle.plot()
 cycle.to_pandas()
-model.stable
+model.is_stable
 model.simulate(np.zeros(16))
 model.plot()
 model.to_pandas()
@@ -91,17 +91,24 @@ est.plot(outputs="yM")
 hj.plot.bode([est, model.htf(est.frequencies)])
 est.plot().save("bode.pdf")
 est.standard_errors
+est["yM"].plot()
+abs(est["yM"].H)
+est["yM"][0]
+est.select(0, outputs="yM", inputs="u")
+est.magnitude
+est.phase
 traj.plot()
 traj.to_pandas()
 rec["yM"]
 rec.plot()
 rec.rate
 rec.duration
+rec.crop(10, 50).duration
 rec.time
 len(rec)
 fit.contains(cycle)
 fit.compare(ser).p_value
-hj.validate(fit, data)
+hj.validate(fit, data).residuals
 hj.validate(phys, data).plot()
 hj.select_order(est).plot()
 hj.optimal_design(model, noise=1e-4).plot()
@@ -127,6 +134,13 @@ hj.plot.multipliers(cycle, fit)
 hj.plot.multipliers(cycle, result)
 hj.plot.bode(model)
 hj.plot.htf([model, model])
+hj.plot.bode(result)
+hj.plot.bode([model, result])
+hj.plot.bode({"exact": model, "fit": result})
+hj.plot.bode(est, fit)
+hj.plot.bode(ser)
+hj.plot.bode(ldtp)
+hj.plot.htf(result)
 hj.experiments.add_noise(data, 1e-5)
 cycle.simultaneous_events()
 repr(hj.explore(hopper, "k"))
@@ -140,6 +154,7 @@ hj.simulate(hopper, duration=0.5)
 hj.flow(hopper, cycle, 0.5)["yM"]
 hj.sweep(hopper, k=10.0)
 hj.continuation(cycle, k=(9.99, 10.01))
+hj.continuation(cycle, k=(9.99, 10.01)).bifurcations
 hj.linearize(cycle, "touchdown").multipliers
 hj.identify_recording(rec.to_pandas(), apex, "u", "yM", n_sections=8, order=2)
 hj.Recording(rec.to_pandas())
@@ -193,11 +208,13 @@ hj.validate(data, model)                                -> wrong order
 hj.save(fit, "fit.npz")                                 -> wrong order
 hj.save("cycle.npz", cycle)                             -> cycle.to_pandas()
 cycle.T                                                 -> `period`
-cycle.is_stable                                         -> `stable`
+cycle.stable                                            -> is `is_stable`
+model.stable                                            -> is `is_stable`
+cycle.stability                                         -> use `is_stable`
+hj.continuation(cycle, "k", (9.9, 10.1), step=1.0).is_stable -> use `stable`
 cycle.eigenvalues                                       -> `multipliers`
 cycle.trajectories                                      -> `trajectory`
 model.poles                                             -> `multipliers`
-est.phase                                               -> np.angle
 fit.standard_error                                      -> `standard_errors`
 fit.conf_int()                                          -> `interval`
 fit.coef_                                               -> `coefficients`
@@ -205,6 +222,9 @@ fit.save("fit.npz")                                     -> hj.save(path, result)
 rat.interval()                                          -> hj.fit_multipliers
 rec.ch_names                                            -> `signals`
 rec.sfreq                                               -> `rate`
+rec.truncate(before=10)                                  -> recording.crop(start, stop)
+hj.identify_recording(rec, apex, tmin=10)                -> recording.crop(start, stop)
+rec.crop(tmin=10)                                       -> recording.crop(start, stop)
 rec.pick("yM")                                          -> recording[name]
 est.plot().savefig("bode.png")                          -> plot.save(path)
 hopper.stiffness                                        -> `k`
@@ -283,14 +303,16 @@ hj.HybridSystem()                                       -> hj.HybridSystem.from_
 hj.Guess("flight", {"yM": 2.0})                         -> in the order of the chart's states
 est.zeros()                                             -> fit_rational(htf)
 est.freqresp([0.1])                                     -> `htf.frequencies`
-est.dcgain()                                            -> abs(htf.H)
+est.dcgain()                                            -> htf.magnitude
 cycle.amplitude                                         -> np.ptp(
 cycle.eigenvectors                                      -> model.monodromy()
 model.observability()                                   -> to_control
 hj.read_sbml("x.xml")                                   -> from_functions
 hj.SINDy()                                              -> hj.fit_model
 hj.models.Lorenz()                                      -> from_functions
-hj.period_doubling(cycle)                               -> branch.points
+hj.period_doubling(cycle)                               -> branch.bifurcations
+hj.continuation(cycle, "k", (9.9, 10.1), step=1.0).points -> is `bifurcations`
+hj.orbits.BranchPoint                                   -> hj.orbits.Bifurcation
 hj.continuation(cycle, "k", bounds=(8, 12))             -> use `range`
 hj.continuation(cycle, "k", (8, 12), NMX=100)           -> `max_points`
 hj.continuation(cycle, "k", (8, 12), ICP=1)             -> its range by its name
@@ -322,7 +344,8 @@ cycle.evaluate(0.3)                                     -> cycle.trajectory()
 cycle.responses("u")                                    -> responses().curve(
 cycle.fluctuations(white=0.01)                          -> white={'yM': 0.01}
 hj.simulate(cycle, n_cycles=5)                          -> cycle.trajectory(periods)
-hj.plot.htf(result)                                     -> result.fit.htf(frequencies)
+hj.plot.bode(fit)                                       -> hj.plot.bode(htf, fit)
+hj.plot.bode(cycle)                                     -> hj.linearize(cycle, sections).htf(
 hj.plot.multipliers([cycle, fit])                       -> hj.plot.multipliers(true, {'fit': fit})
 hj.plot.validation(hj.validate(fit, data))              -> validation.plot()
 hj.plot.save("cycle.png", cycle.plot())                 -> plot.save(path)
@@ -396,10 +419,16 @@ hj.HybridSystem(modes={}, guards={}, resets={})         -> [(name, guard, reset)
 hj.HybridSystem.from_sympy("x")                         -> hj.HybridSystem.from_functions
 hj.models.RelayFeedback()                               -> hj.HybridSystem.from_functions
 model.discretize()                                      -> model.A[k]
-est["yM"]                                               -> htf.H[:, :, htf.outputs.index('y')]
-est.select("yM")                                        -> htf.plot(outputs='y')
+est["YM"]                                               -> use 'yM'
+est.select("yM")                                        -> htf.select(outputs='y')
+est.output("yM")                                        -> `htf['y']`
 design.n_realizations                                   -> of all realizations together
-ser.residuals                                           -> validation.measured
+ser.residuals                                           -> validation.residuals
+result.bode()                                           -> hj.plot.bode(result)
+fit.bode()                                              -> hj.plot.bode(htf, fit)
+model.bode()                                            -> hj.plot.bode(model)
+hj.validate(fit, data).resid                            -> use `residuals`
+result.residuals                                        -> validation.residuals
 hj.fit_series(data, order=(1, 2, 3))                    -> hj.select_order(data)
 hj.fit_multipliers(est, range(1, 4))                    -> hj.select_order(htf)
 hj.fit_model(hopper, rec, {"k": 20.0})                  -> ObservedTrajectory(hj.Guess(
@@ -702,10 +731,9 @@ def test_what_leads_name_runs(names):
     """The calls of sentences that other tests hold only by their words."""
     ser, data, est = names["ser"], names["data"], names["est"]
     validation = hj.validate(ser, data)
-    residuals = validation.measured - validation.simulated
+    residuals = validation.residuals
     assert 0 < np.abs(residuals).max() < np.abs(data.y).max()
-    of_output = est.H[:, :, est.outputs.index("yM")]
-    assert_array_equal(of_output, np.asarray(est.H)[:, :, 0])
+    assert_array_equal(est["yM"].H, est.select(outputs="yM").H)
     assert est.plot(outputs="yM").axes.size
     groups = {"subject": list("abcd"), "group": list("xxyy")}
     people = hj.recordings.Population.from_fits([names["result"]] * 4, groups)

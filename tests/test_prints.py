@@ -17,7 +17,7 @@ from hybridjax._core.html import Curve, picture
 from hybridjax._core.public import place_of
 from hybridjax._core.text import p_value, rounded, standard_error
 from hybridjax.experiments.data import Simulated
-from hybridjax.orbits.branches import Branch, BranchEnd, BranchPoint
+from hybridjax.orbits.branches import Bifurcation, Branch, BranchEnd
 from hybridjax.systems.system import own_fields
 
 from .conftest import APEX, KINEMATIC, OUTPUTS
@@ -168,7 +168,7 @@ def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
         m.A, m.B, m.C, m.D, m.dims, inputs="<u>", outputs=("yM & co", "vM")
     )
     multipliers = np.array([-1.0 + 0j, 0.5])
-    point = BranchPoint("flip", 1, 2.0, multipliers)
+    point = Bifurcation("flip", 1, 2.0, multipliers)
     branch = Branch(
         "k", np.array([1.0, 2.0]), many(hopper_cycle, 2), (point,), (end, end)
     )

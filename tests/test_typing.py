@@ -55,6 +55,12 @@ hj.find_limit_cycle(lambda t, q: (q[1], -q[0]), (2.0, 0.0)).multipliers
 float(hj.flow(hopper, [2.0, 1.0, 0.0, 0.0], 1.0)["yM"])
 hj.sweep(hopper, k=[9.0, 10.0], b=5.0)
 hj.continuation(cycle, k=(9.0, 11.0)).stable
+hj.continuation(cycle, k=(9.0, 11.0)).bifurcations[0].kind
+model.htf([0.1])["yM"].select(0, outputs="yM", inputs="u").magnitude.shape
+model.htf([0.1])[0].shape
+hj.plot.bode(hj.fit_series(data, order=2))
+hj.plot.bode({"both": [model, hj.fit_series(data, order=2)]})
+recording.crop(0.0, stop=10.0).duration
 hj.linearize(cycle, ["touchdown", apex])
 hj.fitting.ObservedCycle(phase, "yM", jnp.zeros((32, 1)), period=1.0, std=0.1)
 """
@@ -190,9 +196,9 @@ UNCHECKED = {
     },
     "made by this package": {
         "Arrival",
+        "Bifurcation",
         "Branch",
         "BranchEnd",
-        "BranchPoint",
         "Constrained",
         "Coupling",
         "Diagnosis",

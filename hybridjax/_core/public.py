@@ -23,6 +23,7 @@ _ROOT = pathlib.Path(__file__).parents[1]
 # names that are others elsewhere.)
 _NAMES = {
     "Advice": "hj.recordings.Diagnosis",
+    "BranchPoint": "hj.orbits.Bifurcation",
     "FrequencyResponse": "hj.designs.ResponseGoal",
     "Multipliers": "hj.designs.MultiplierGoal",
     "Options": "hj.run_experiments(..., start=, discard=, ...)",
@@ -69,6 +70,7 @@ _NAMES = {
 }
 # From former names of arguments and attributes to the present ones.
 _WORDS = {
+    "Branch.points": "bifurcations",
     "Crossing.function": "signal",
     "Design.f": "frequency",
     "Design.input_names": "inputs",
@@ -78,6 +80,8 @@ _WORDS = {
     "HTF.f": "frequencies",
     "HTF.scatter": "variance_dof",
     "Identification.advice": "diagnosis",
+    "LDTP.stable": "is_stable",
+    "LimitCycle.stable": "is_stable",
     "Limits.strides": "cycles",
     "MultiplierGoal.overhang": "extra_lags",
     "OptimalDesign.strides": "cycles",

@@ -167,7 +167,7 @@ def _(thing: LimitCycle) -> Any:
     table["period"] = [float(thing.period)]
     for k, multiplier in enumerate(thing.multipliers):
         table |= _parts(f"multipliers.{k}.", np.array([multiplier]))
-    table["stable"] = [thing.stable]
+    table["stable"] = [thing.is_stable]
     return table
 
 

@@ -303,10 +303,10 @@ def _from_limit_cycles(cycles: LimitCycles, dimension: str) -> Any:
 
 
 def _from_branch(branch: Branch) -> Any:
-    """Return the dataset of the cycles, with the kinds of special points ("" for other points) and
+    """Return the dataset of the cycles, with the kinds of bifurcations ("" for other points) and
     the stability of the cycles."""
     kinds = np.full(len(branch), "", dtype="U16")
-    for point in branch.points:
+    for point in branch.bifurcations:
         kinds[point.index] = point.kind
     return _from_limit_cycles(branch.cycles, "point").assign(
         multipliers=(("point", "multiplier"), branch.multipliers),

@@ -52,7 +52,9 @@ def criterion_of(
     **Raises:** `DefinitionError` for multipliers that do not exist or are not simple, parameters
     that do not exist, and combinations that the data do not identify, which are named.
     """
-    if isinstance(goal, ParameterGoal) and (len(models) > 1 or not goal.cycle.stable):
+    if isinstance(goal, ParameterGoal) and (
+        len(models) > 1 or not goal.cycle.is_stable
+    ):
         raise DefinitionError(
             "a `goal` of parameters needs a single `model` and a stable `cycle`."
         )

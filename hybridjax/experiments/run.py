@@ -466,7 +466,7 @@ def _require_return(
             "phase back (a multiplier of exactly 1). Use sections that depend on the state "
             "(KinematicPhase, or a list of Crossing and AtEvent)."
         )
-    if not cycle.stable and not stabilized:
+    if not cycle.is_stable and not stabilized:
         largest = np.abs(cycle.multipliers[0])
         raise ComputationError(
             f"the limit cycle is not stable (largest multiplier {largest:.4g}): stabilize it, as "

@@ -122,6 +122,11 @@ class Validation(Showable, eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     findings: tuple[Finding, ...] = eqx.field(static=True, default=())
 
+    @property
+    def residuals(self) -> Float[np.ndarray, "n ny"]:
+        """Measured less simulated outputs, of the longest record."""
+        return self.measured - self.simulated
+
     @checked
     def plot(self, *, cycles: PeriodCount = 4, ax: object = None) -> Any:
         """Draw measured and simulated outputs, and correlations of the residuals; one row per

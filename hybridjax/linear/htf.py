@@ -1,7 +1,8 @@
 """Harmonic transfer functions: exact or estimated, one container for both."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, overload, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -10,9 +11,9 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._core import limits
-from .._core.arguments import Numbers, names, require_same
+from .._core.arguments import Numbers, names, require_among, require_same
 from .._core.boundary.checked import checked
-from .._core.boundary.kinds import NewNames, Probability, Vector
+from .._core.boundary.kinds import NewNames, Probability, SignalNames, Vector
 from .._core.boundary.values import Complexes, Reals, Whole
 from .._core.executor import from_host, is_traced, namespace, put, to_host
 from .._core.html import COLORS, Curve, card, picture
@@ -237,21 +238,62 @@ class HTF(Showable, eqx.Module):
         about = repr(self).partition(";")[2].removesuffix(")")
         return card("HTF", f"({self.source}):{about}", *drawn)
 
-    def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]:
-        """`H_m`; `m` counts modulo `N`.
+    @overload
+    def __getitem__(self, m: int) -> Complex[Array, "F ny nu"]: ...
+    @overload
+    def __getitem__(self, m: str) -> "HTF": ...
+    def __getitem__(self, m: int | str) -> Any:
+        """`htf[0]` has the values of `H_0`, (F, ny, nu); `m` counts modulo `N`. `htf["yM"]` is the
+        HTF of an output.
 
-        **Raises:** `DefinitionError` if it is not among the harmonics stored.
+        **Raises:** `DefinitionError` if it is not among the harmonics or outputs stored.
         """
+        if isinstance(m, str):
+            return self.select(outputs=m)
         return from_host(to_host(self.H)[self._index(m)])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """`H`, for functions of NumPy."""
         return np.array(self.H, dtype) if copy else np.asarray(self.H, dtype)
 
-    def select(self, harmonics: Harmonics) -> "HTF":
-        """The same with fewer harmonics."""
+    @property
+    def magnitude(self) -> Float[Array, "M F ny nu"]:
+        """|H|, in units of the output per unit of the input."""
+        H = to_host(self.H)
+        return from_host(namespace(H).abs(H))
+
+    @property
+    def phase(self) -> Float[Array, "M F ny nu"]:
+        """The angle of H in radians, from -pi to pi: not unwrapped."""
+        H = to_host(self.H)
+        return from_host(namespace(H).angle(H))
+
+    def select(
+        self,
+        harmonics: Harmonics | None = None,
+        *,
+        outputs: SignalNames | None = None,
+        inputs: SignalNames | None = None,
+    ) -> "HTF":
+        """Return the HTFs of some harmonics, outputs and inputs, with their variances.
+
+        **Arguments:** `harmonics`: one integer or several. `outputs`, `inputs`: names, in the order
+        that is wanted. Default: all.
+
+        **Raises:** `DefinitionError` for a harmonic, an output or an input that is not there.
+
+        **Example:**
+
+        ```python
+        htf.select(0, outputs="yM").plot()
+        ```
+        """
+        if harmonics is None:
+            harmonics = self.harmonics
         harmonics = check_harmonics(harmonics, self.n_sections)
         rows = np.array([self._index(m) for m in harmonics])
+        outputs, i = _chosen("output", outputs, self.outputs)
+        inputs, j = _chosen("input", inputs, self.inputs)
         arrays = {
             "H": self.H,
             "variance": self.variance,
@@ -259,11 +301,20 @@ class HTF(Showable, eqx.Module):
         }
         if self.variance_dof is not None:
             arrays["roundness"] = self.variance_dof.roundness
-        chosen = jax.tree.map(lambda x: x[rows], to_host(arrays))
+        part = jax.tree.map(lambda x: x[rows][:, :, i][..., j], to_host(arrays))
         variance_dof = self.variance_dof
         if variance_dof is not None:
-            variance_dof = replace(variance_dof, roundness=chosen.pop("roundness"))
-        return replace(self, harmonics=harmonics, variance_dof=variance_dof, **chosen)
+            variance_dof = replace(variance_dof, roundness=part.pop("roundness"))
+        power = None if self.power is None else to_host(self.power)[:, j]
+        return replace(
+            self,
+            harmonics=harmonics,
+            outputs=outputs,
+            inputs=inputs,
+            variance_dof=variance_dof,
+            power=power,
+            **part,
+        )
 
     def __matmul__(self, other: "HTF | HasHTF") -> "HTF":
         """This system after another, which acts first: the series `P @ Q`.
@@ -439,6 +490,17 @@ class HTF(Showable, eqx.Module):
                 f"harmonic {m} is not there; harmonics are {self.harmonics}."
             )
         return self.harmonics.index(m)
+
+
+def _chosen(
+    kind: str, wanted: Sequence[str] | None, names: tuple[str, ...]
+) -> tuple[tuple[str, ...], Int[np.ndarray, " k"]]:
+    """Return the signals of these names, with their units, and their indices."""
+    if wanted is None:
+        wanted = names
+    require_among(kind, wanted, names)
+    indices = [names.index(name) for name in wanted]
+    return tuple(names[k] for k in indices), np.array(indices)
 
 
 @runtime_checkable

@@ -195,7 +195,7 @@ class LDTP(WithMultipliers, eqx.Module):
         return self.A.shape[0]
 
     @property
-    def stable(self) -> bool:
+    def is_stable(self) -> bool:
         """True if all multipliers lie inside the unit circle."""
         return bool((self.modulus < 1).all())
 

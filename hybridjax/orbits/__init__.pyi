@@ -1,9 +1,9 @@
 from ..engine.settings import Settings as Settings
 from ..engine.trajectory import Event as Event, Trajectory as Trajectory
 from .branches import (
+    Bifurcation as Bifurcation,
     Branch as Branch,
     BranchEnd as BranchEnd,
-    BranchPoint as BranchPoint,
 )
 from .coincidence import (
     SimultaneousEvents as SimultaneousEvents,

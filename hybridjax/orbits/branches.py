@@ -61,8 +61,8 @@ KINDS: tuple[str, ...] = get_args(Kind)
 
 
 @leading_on
-class BranchPoint(NamedTuple):
-    """A point of a branch with a multiplier on the unit circle."""
+class Bifurcation(NamedTuple):
+    """A bifurcation: a point of a branch with a multiplier on the unit circle."""
 
     kind: str
     """"fold" (a multiplier +1: the branch turns back), "branch point" (+1: another branch crosses),
@@ -100,15 +100,15 @@ class Branch(Showable, eqx.Module):
 
     - `parameter`: its name. `values` (K,): its values.
     - `cycles`: the K cycles; `branch[k]` is one of them, with its system.
-    - `points`: points at which multipliers cross the unit circle; each is also one of the K cycles
-      (its `index`).
+    - `bifurcations`: points at which multipliers cross the unit circle, each a `Bifurcation`; it is
+      also one of the K cycles (its `index`).
     - `ends`: the two ends of the branch, with their reasons.
     """
 
     parameter: str = eqx.field(static=True)
     values: Float[np.ndarray, " K"]
     cycles: LimitCycles
-    points: tuple[BranchPoint, ...]
+    bifurcations: tuple[Bifurcation, ...]
     ends: tuple[BranchEnd, BranchEnd]
 
     def __len__(self) -> int:
@@ -136,9 +136,9 @@ class Branch(Showable, eqx.Module):
 
     @remembered
     def stable(self) -> Bool[np.ndarray, " K"]:
-        """True for each stable cycle. At a marked point itself rounding decides."""
+        """True for each stable cycle. At a bifurcation itself rounding decides."""
         if self.cycles.conserved:
-            return np.array([cycle.stable for cycle in self._each])
+            return np.array([cycle.is_stable for cycle in self._each])
         # (By the product of the factors: its rounding errors are small compared to 1.)
         within = np.abs(self.cycles.multipliers) < 1
         return np.array([each.all() for each in within])
@@ -153,10 +153,10 @@ class Branch(Showable, eqx.Module):
         )
 
     def summary(self) -> str:
-        """One line for each marked point and each end."""
+        """One line for each bifurcation and each end."""
         begin, end = self.ends
         lines = [f"from {self.parameter} = {begin.value:.9g}: {begin.message}"]
-        for p in self.points:
+        for p in self.bifurcations:
             at = ", ".join(map(number, p.critical))
             lines.append(
                 f"{p.kind} at {self.parameter} = {p.value:.12g} (multipliers {at})"
@@ -170,11 +170,12 @@ class Branch(Showable, eqx.Module):
 
     def _repr_html_(self) -> str:
         largest = np.abs(self.multipliers).max(axis=1)
-        marks = [p.index for p in self.points]
+        marks = [p.index for p in self.bifurcations]
         begin, end = self.ends
         rows = [("from", begin.value, begin.message)]
         rows += [
-            (p.kind, p.value, ", ".join(map(number, p.critical))) for p in self.points
+            (p.kind, p.value, ", ".join(map(number, p.critical)))
+            for p in self.bifurcations
         ]
         rows += [("to", end.value, end.message)]
         rows = [(name, f"{value:.9g}", text) for name, value, text in rows]
@@ -220,9 +221,9 @@ def continuation(
         states. Default: 0.05.
     - `max_points`: largest number of cycles in each direction. Default: 1000.
 
-    **Returns:** a `Branch`. If it ends earlier, no error is raised, and `ends` has the reason: an
-    event that grazes, is lost or comes out of order, no convergence even in the shortest step, or
-    an equilibrium in place of a cycle.
+    **Returns:** a `Branch`, with its cycles and `bifurcations`. If it ends earlier, no error is
+    raised, and `ends` has the reason: an event that grazes, is lost or comes out of order, no
+    convergence even in the shortest step, or an equilibrium in place of a cycle.
 
     **Raises:** `DefinitionError` for a parameter that does not exist, values without order, or a
     cycle that was not found or lies outside of the values.
@@ -231,7 +232,7 @@ def continuation(
 
     ```python
     branch = hj.continuation(cycle, k=(10.0, 11.0), step=0.5)
-    print(branch.values, branch.stable)
+    print(branch.values, branch.stable, branch.bifurcations)
     ```
 
     **Before:** `hj.find_limit_cycle`. **After:** `hj.plot.branch`, `branch.to_pandas()`.
@@ -349,7 +350,7 @@ def _branch(
     begin = _explained(cycles[0], begin)
     end = _explained(cycles[len(points) - 1], end)
     marked = tuple(
-        BranchPoint(
+        Bifurcation(
             kind=point.kind,
             index=k,
             value=point.value,

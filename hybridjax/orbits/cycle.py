@@ -283,7 +283,7 @@ class LimitCycle(WithMultipliers, eqx.Module):
         return verdict(self).not_reached
 
     @property
-    def stable(self) -> bool:
+    def is_stable(self) -> bool:
         """True if all multipliers lie inside the unit circle. Multipliers of exactly 1 that belong
         to conserved quantities do not count."""
         inside = np.abs(self.multipliers) < 1

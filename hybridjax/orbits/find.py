@@ -171,7 +171,7 @@ def find_limit_cycle(
         Default: True.
 
     **Returns:** a `LimitCycle`: `period` in the system's unit of time, `multipliers` (d,),
-    `stable`, `state` and `trajectory()`, and `result`, a code of `hj.errors.Result`.
+    `is_stable`, `state` and `trajectory()`, and `result`, a code of `hj.errors.Result`.
 
     **Raises:** `DefinitionError` for bad arguments, and for functions whose dependence on time
     contradicts `system.period()`; `ComputationError` if no isolated cycle is found: no

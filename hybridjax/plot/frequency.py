@@ -13,8 +13,10 @@ from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Positive, SignalNames
 from .._core.signal import SECONDS, ratio, with_unit
 from ..errors import DefinitionError
+from ..identify.joint.fit import LDTPFit
 from ..identify.multipliers import StructuredFit
 from ..identify.rational import RationalFit
+from ..identify.series.fit import SeriesFit
 from ..linear.htf import HTF
 from ..linear.ldtp import LDTP
 from ..orbits.cycle import LimitCycle
@@ -22,10 +24,12 @@ from ..systems.system import name_of
 from .look import COLORS, COLUMN, CYCLE, PAGE, AxesLike, Plot, letters, panels
 
 
-Fit = RationalFit | StructuredFit
-Transfer = HTF | LDTP
-"""HTFs, and models, whose HTFs are drawn at the frequencies of the first HTF beside them, or over
-all frequencies."""
+InBand = RationalFit | StructuredFit
+"""Fits to HTFs, which hold in the band of these."""
+Fit = InBand | SeriesFit | LDTPFit
+Transfer = HTF | LDTP | Fit
+"""HTFs, and models and fits, whose HTFs are drawn at the frequencies of the first HTF beside them,
+or over all frequencies."""
 Families = Mapping[str, Transfer | Sequence[Transfer]]
 """HTFs by name, such as that of a family of sections."""
 Fits = Fit | Sequence[Fit]
@@ -39,10 +43,6 @@ _OUTPUTS = [
     COLORS[name] for name in ("green", "red", "blue", "purple", "orange", "sky")
 ]
 _FIT_STYLE = {"color": "black", "lw": 0.8, "ls": (0, (4, 1.5))}
-_FIT_NAMES: dict[type, str] = {
-    RationalFit: "rational fit",
-    StructuredFit: "structured fit",
-}
 
 
 @checked
@@ -57,16 +57,18 @@ def htf(
     """Draw |H_m| against the input frequency, on a logarithmic scale.
 
     One color per |m|, dashed for negative m. Exact HTFs, and those of models (`LDTP`), are drawn as
-    broad pale lines under the estimates, in any order of the arguments. Models are drawn at the
-    frequencies of the first HTF. Without an HTF, they are drawn over all frequencies. HTFs with a
-    variance have a band that holds the true value at each frequency with a probability of 95 %.
+    broad pale lines under the estimates, in any order of the arguments. Models and fits are drawn
+    at the frequencies of the first HTF. Without an HTF, they are drawn over all frequencies. HTFs
+    with a variance have a band that holds the true value at each frequency with a probability of
+    95 %.
 
     **Arguments:**
 
     - `htfs`: one HTF or several, also in a list, for a panel with one output; or a dict by name
       (the paper's Fig. 3), for a column for each name and a row for each output. An entry is an
       HTF, or several (an estimate, and an exact HTF or a model); all have the same outputs, and a
-      row shares one scale.
+      row shares one scale. Models, fits and the results of `hj.identify_recording` stand for their
+      HTFs.
     - `output`: name or index. Default: the first; all outputs of a dict.
     - `input`: name or index. The axis names the input if there are several. Default: 0.
     - `harmonics`: the m of the H_m. Default: (0, 1, -1).
@@ -94,7 +96,8 @@ def htf(
         with panels(ax, height=2.2) as axes:
             _magnitude(axes[0, 0], drawn, shown, input, harmonics, decades)
         return Plot(axes)
-    columns = _columns(families)
+    by_name = _by_column(families)
+    columns = {name: _exact_first(given) for name, given in by_name.items()}
     outputs = next(iter(columns.values()))[0].outputs
     if output is not None:
         outputs = (_pick("output", output, outputs),)
@@ -162,7 +165,9 @@ def bode(
       for a column for each name. Exact HTFs, and those of models (`LDTP`), are drawn as broad pale
       lines under the estimates: models at the frequencies of the first HTF, and models alone over
       all. HTFs with a variance have bands that contain the true values with a probability of 95 %.
-      Their phase is not drawn where the band of the magnitude contains zero.
+      Their phase is not drawn where the band of the magnitude contains zero. Fits to data, and the
+      results of `hj.identify_recording`, are drawn as models are if they are alone, and beside
+      HTFs or models as `fits`.
     - `fits`: fits to this harmonic, drawn over the frequency band of the HTFs, each for the inputs
       that it has; by name beside a dict of HTFs. Default: none.
     - `harmonic`: the m of H_m. Default: 0.
@@ -183,7 +188,8 @@ def bode(
     these), phases in degrees.
 
     **Raises:** `DefinitionError` for a name or harmonic that does not exist, for fits that have
-    none of the inputs, for a unit of time without a period, if no frequency is positive on a
+    none of the inputs, for a fit to HTFs without an HTF beside it, for a unit of time without a
+    period, if no frequency is positive on a
     logarithmic axis, or if `ax` does not hold one Axes per panel.
 
     **Example:**
@@ -203,8 +209,9 @@ def bode(
     scale = _Scale.of(unit, period, log)
     if isinstance(fits, Mapping):
         raise DefinitionError("`fits` by name need HTFs by name: pass a dict of them.")
-    drawn = _exact_first(_one_by_one(htfs))
-    fits = (fits,) if isinstance(fits, Fit) else tuple(fits)
+    shown, beside = _apart(_one_by_one(htfs))
+    drawn = _exact_first(shown)
+    fits = (*beside, *((fits,) if isinstance(fits, Fit) else fits))
     fitted = [fit.htf(drawn[-1].frequencies) for fit in fits]
     curves = _curves(drawn[0], outputs, input)
     for htf in fitted:
@@ -220,8 +227,8 @@ def bode(
             color = _OUTPUTS[number % len(_OUTPUTS)]
             label = with_unit(curve.label, "" if same else curve.unit)
             bode_panels.curve(curve, harmonic, drawn, fitted, color, label)
-        for kind in dict.fromkeys(map(type, fits)):
-            upper.plot([], [], **_FIT_STYLE, label=_FIT_NAMES[kind])
+        for kind in dict.fromkeys(htf.source for htf in fitted):
+            upper.plot([], [], **_FIT_STYLE, label=kind)
         symbol = _name(harmonic)[1:-1]
         bode_panels.label(symbol, same, np.asarray(drawn[-1].frequencies))
         # (Over a logarithmic axis the upper right corner is no longer empty.)
@@ -412,7 +419,7 @@ def _bodes(
     ax: AxesLike | None,
 ) -> Plot:
     """Bode plots side by side, with the same options of `bode`."""
-    columns = _columns(families)
+    columns = _by_column(families)
     if not isinstance(fits, Mapping):
         fits = dict.fromkeys(families, fits)
     require_among("name", fits, families, "`fits`: ")
@@ -443,8 +450,8 @@ def _families(htfs: Given) -> Families | None:
     return named[0]
 
 
-def _columns(families) -> dict[str, list[HTF]]:
-    columns: dict[str, tuple] = {}
+def _by_column(families: Families) -> dict[str, tuple[Transfer, ...]]:
+    columns: dict[str, tuple[Transfer, ...]] = {}
     outputs: set[tuple[str, ...]] = set()
     for name, htfs in dict(families).items():
         columns[name] = (htfs,) if isinstance(htfs, Transfer) else tuple(htfs)
@@ -453,7 +460,14 @@ def _columns(families) -> dict[str, list[HTF]]:
         raise DefinitionError("a dict of HTFs must hold at least one for each name.")
     if len(outputs) > 1:
         raise DefinitionError("HTFs must have the same outputs to share a figure.")
-    return {name: _exact_first(htfs) for name, htfs in columns.items()}
+    return columns
+
+
+def _apart(htfs: Sequence[Transfer]) -> tuple[list[Transfer], list[Fit]]:
+    """HTFs and models, and the fits to be drawn over them; fits alone are drawn as HTFs are."""
+    fits = [x for x in htfs if isinstance(x, Fit)]
+    others: list[Transfer] = [x for x in htfs if not isinstance(x, Fit)]
+    return (others, fits) if others else (list(htfs), [])
 
 
 @contextlib.contextmanager
@@ -482,6 +496,12 @@ def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
         raise DefinitionError("`htfs` holds nothing to draw.")
     grids = [htf.frequencies for htf in htfs if isinstance(htf, HTF)]
     if not grids:
+        for fit in htfs:
+            if isinstance(fit, InBand):
+                raise DefinitionError(
+                    f"a {type(fit).__name__} holds in the band of its data: draw it beside their "
+                    "HTF, `hj.plot.bode(htf, fit)`, or its own, `fit.htf(frequencies)`."
+                )
         grids = [np.linspace(0, htfs[0].n_sections / 2, _FREQUENCIES)]
     drawn = [htf if isinstance(htf, HTF) else htf.htf(grids[0]) for htf in htfs]
     return sorted(drawn, key=lambda htf: htf.source != "exact")

@@ -567,7 +567,7 @@ def portrait(
         curves = by_chart(path, *plane)
         for a, line in enumerate(orbits):
             line.set_data(curves.get(a, ([], [])))
-            line.set_linestyle("-" if cycle.stable else "--")
+            line.set_linestyle("-" if cycle.is_stable else "--")
         events, ends, _ = at_events(path, *plane)
         marks.set_data(ends.T)
         for g, note in enumerate(notes):
@@ -620,7 +620,7 @@ def _of_branch(branch: Branch, x: str | None, y: str | None, interval: float) ->
             moved = draw_cycle(cycle)
             widened(below)
             text = f"{branch.parameter} = {value:.4g}"
-            texts.append(text if cycle.stable else f"{text}, unstable")
+            texts.append(text if cycle.is_stable else f"{text}, unstable")
         head = above.set_title("", loc="left")
         parts: list[Part] = [(x, lambda _: None, values) for x in moved]
         parts.append((head, head.set_text, texts))

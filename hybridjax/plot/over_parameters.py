@@ -69,7 +69,7 @@ def branch(
                 line = "-" if stable else "--"
                 drawn.add(line)
                 panel.plot(b.values[part], height[part], line, color=color)
-            for p in b.points:
+            for p in b.bifurcations:
                 marker, tint = _MARKS[p.kind]
                 panel.plot(
                     p.value,
@@ -97,8 +97,8 @@ def branch(
 
 
 def _parts(branch: Branch) -> list[tuple[slice, bool]]:
-    """Rows from one marked point to the next, and whether the cycles between them are stable."""
-    cuts = [0, *(p.index for p in branch.points), len(branch) - 1]
+    """Rows from one bifurcation to the next, and whether the cycles between them are stable."""
+    cuts = [0, *(p.index for p in branch.bifurcations), len(branch) - 1]
     parts = []
     for a, b in itertools.pairwise(cuts):
         if b > a:

@@ -39,6 +39,10 @@ from .formats.columns import (
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
+# Trials that an error names. More: it is longer than a line.
+_NAMED = 3
+
+
 def _has_columns(value: Any) -> bool:
     names = ("keys", "column_names", "columns")
     return any(inspect.getattr_static(value, name, None) is not None for name in names)
@@ -315,6 +319,39 @@ class Recording(Showable, eqx.Module, metaclass=Leading):
             trials.append(replace(trial, events=trial.events | {event: crossed}))
         return self.with_trials(trials)
 
+    def crop(
+        self, start: float | None = None, stop: float | None = None
+    ) -> "Recording":
+        """Return the part of each trial between two times.
+
+        A part has the samples from `start` on and before `stop`: two parts side by side,
+        `crop(None, t)` and `crop(t, None)`, have no sample twice. Signals, units, findings and
+        names stay. Events between the two times stay, except those that are more than a sample away
+        from the samples that are left. A trial with less than two samples in between is left out.
+
+        **Arguments:** `start` and `stop`: times in s on the clock of the trials, as in
+        `recording.time`; they do not count from the first sample. Default: None, no limit.
+
+        **Raises:** `DefinitionError` if `start` is not before `stop`, and if no trial is left.
+
+        **Example:** without the first ten seconds:
+
+        ```python
+        later = recording.crop(10.0)
+        ```
+        """
+        low = -np.inf if start is None else start
+        high = np.inf if stop is None else stop
+        if not low < high:
+            raise DefinitionError(
+                f"Recording.crop: `start` must be before `stop`, not {low:.10g} and {high:.10g}."
+            )
+        parts = [_part(trial, low, high) for trial in self.trials]
+        left = [part for part in parts if len(part.time) > 1]
+        if not left:
+            raise DefinitionError(_about_nothing_left(self, start, stop))
+        return self.with_trials(left)
+
     def with_trials(self, trials: Iterable[Trial]) -> "Recording":
         """Replace the trials."""
         return eqx.tree_at(lambda r: r.trials, self, tuple(trials))
@@ -411,6 +448,41 @@ def _table_of(
     table = parse_table(where, columns, time)
     return table._replace(
         events=table.events | dict(events or {}), units=table.units | dict(units or {})
+    )
+
+
+def _part(trial: Trial, low: float, high: float) -> Trial:
+    """Return the samples and events at times from `low` on and before `high`."""
+
+    def within(times: Series) -> Any:
+        return (times >= low) & (times < high)
+
+    kept = within(trial.time)
+    time = trial.time[kept]
+    events = {}
+    for name, at in trial.events.items():
+        inside = at[within(at)]
+        events[name] = inside[_near(inside, time)] if len(time) > 1 else inside
+    return replace(trial, time=time, values=trial.values[kept], events=events)
+
+
+def _about_nothing_left(
+    recording: Recording, start: float | None, stop: float | None
+) -> str:
+    if stop is None:
+        asked = f"from {start:.10g} s on"
+    elif start is None:
+        asked = f"before {stop:.10g} s"
+    else:
+        asked = f"from {start:.10g} to {stop:.10g} s"
+    spans = [
+        f"{trial.time[0]:.6g} to {trial.time[-1]:.6g} s ('{trial.name}')"
+        for trial in recording.trials[:_NAMED]
+    ]
+    more = ", ..." if len(recording) > _NAMED else ""
+    return (
+        f"Recording.crop: less than two samples {asked} are left: samples lie in "
+        f"{', '.join(spans)}{more}."
     )
 
 
@@ -521,13 +593,18 @@ def check_events(
     **Raises:** `DefinitionError` if all events lie outside.
     """
     at = at[np.isfinite(at)]
-    margin = float(np.median(np.diff(time)))
-    begun = at >= time[0] - margin
-    not_over = at <= time[-1] + margin
-    within = begun & not_over
+    within = _near(at, time)
     if len(at) and not within.any():
         raise DefinitionError(
             f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording "
             f"({time[0]:.6g} to {time[-1]:.6g} s): check their unit."
         )
     return at[within]
+
+
+def _near(at: Series, time: Series) -> Any:
+    """Return which events happen during the recording, or within one sample of it."""
+    margin = float(np.median(np.diff(time)))
+    begun = at >= time[0] - margin
+    not_over = at <= time[-1] + margin
+    return begun & not_over

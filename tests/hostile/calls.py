@@ -208,7 +208,7 @@ def transfer_functions(t):
     yield t.estimate.require_sampled, dict(name="a fit")
     htf = t.estimate
     yield htf.__getitem__, dict(m=0)
-    yield htf.select, dict(harmonics=0)
+    yield htf.select, dict(harmonics=0, outputs=None, inputs=None)
     yield htf.predict, dict(u=np.ones((12, 2)))
     for name in ("error", "harmonic_errors"):
         yield getattr(htf, name), dict(other=t.exact)
@@ -376,6 +376,7 @@ def recordings(t):
     rises = hj.Crossing("x", "rising")
     angle = hj.KinematicPhase(4, position="x", velocity="v")
     yield t.recording.mark, dict(event="e", crossing=rises)
+    yield t.recording.crop, dict(start=0.0, stop=1.0)
     for name in ("column", "samples", "unit", "__getitem__"):
         yield getattr(t.recording, name), dict(name="x")
     yield hj.recordings.estimate_phase, dict(recording=t.recording, sections=angle)

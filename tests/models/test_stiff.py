@@ -56,7 +56,7 @@ def test_relaxation_oscillations(name):
         at_top = _top(cycle, t[np.argmax(x)])
     assert at_top == pytest.approx(top, rel=1e-9)
     assert cycle.log_multipliers == pytest.approx([logarithm], rel=1e-6)
-    assert cycle.stable
+    assert cycle.is_stable
 
 
 def _top(cycle, near):

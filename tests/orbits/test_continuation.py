@@ -48,7 +48,7 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
     flip = np.hypot(paddle_speed / (2 * np.pi), weight)
 
     branch = by_amplitude
-    at_fold, at_flip = branch.points
+    at_fold, at_flip = branch.bifurcations
     assert at_fold.kind == "fold"
     assert at_flip.kind == "flip"
     assert_allclose(at_fold.value, fold, rtol=1e-11)
@@ -77,7 +77,7 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
 def test_neimark_sacker_of_the_juggler(juggling):
     """The product of the multipliers is the restitution's square: 1 where nothing is lost."""
     branch = hj.continuation(juggling, "restitution", (0.7, 1.1))
-    (point,) = branch.points
+    (point,) = branch.bifurcations
     assert_allclose(point.value, 1.0, rtol=1e-11)
     assert_allclose(np.abs(point.multipliers), 1, rtol=1e-9)
     assert point.kind == "Neimark-Sacker"
@@ -98,7 +98,7 @@ def test_a_branch_is_drawn_in_pieces_of_one_stability(by_amplitude):
     lines = [line for line in ax.get_lines() if len(line.get_xdata()) > 1]
     styles = [line.get_linestyle() for line in lines]
     assert styles == ["--", "-", "--"], "unstable, stable, unstable"
-    fold, flip = (point.index for point in branch.points)
+    fold, flip = (point.index for point in branch.bifurcations)
     drawn = [line.get_xdata() for line in lines]
     before_fold = branch.values[: fold + 1]
     assert_array_equal(drawn[0], before_fold)
@@ -117,7 +117,7 @@ def test_a_branch_becomes_a_dataset_and_a_table(by_amplitude):
     assert_array_equal(dataset["multipliers"], branch.multipliers)
     table = branch.to_pandas()
     rows_of_points = table[table["kind"] != ""].index
-    assert list(rows_of_points) == [point.index for point in branch.points]
+    assert list(rows_of_points) == [point.index for point in branch.bifurcations]
 
 
 @settings(max_examples=3, phases=(Phase.generate,))
@@ -196,7 +196,7 @@ def test_period_2_of_the_buck_converter():
     assert_allclose(cycle.multipliers, [pair, np.conj(pair)], rtol=1e-9)
 
     branch = hj.continuation(cycle, "Vin", (24.0, 25.5))
-    (point,) = branch.points
+    (point,) = branch.bifurcations
     assert point.kind == "branch point"
     assert_allclose(point.value, 24.5165728285634, rtol=1e-7)
     assert branch.values[0] == 25.5
@@ -218,7 +218,7 @@ def test_a_foot_that_stays_on_the_ground(hopper_cycle):
     assert_allclose(branch.ends[0].value, expected, rtol=2e-6)
     # More, and liftoff comes before the phase at which the cycle given begins.
     assert branch.ends[1].message == "end of the parameter range"
-    assert not branch.points
+    assert not branch.bifurcations
     assert branch.values[-1] == 30.0
     time = float(branch[-1].anchor.t[0])
     assert time != 0.5
@@ -269,11 +269,11 @@ def test_multipliers_that_cross_the_circle_together_or_beside_others():
     ):
         hj.continuation(cycle, "growth.c", (1.0, 2.0))
     branch = hj.continuation(cycle, "growth.r", (1.9, 3.1), step=1.0)
-    kinds = [point.kind for point in branch.points]
+    kinds = [point.kind for point in branch.bifurcations]
     assert kinds == ["Neimark-Sacker", "Neimark-Sacker", "flip"]
-    critical = [len(point.critical) for point in branch.points]
+    critical = [len(point.critical) for point in branch.bifurcations]
     assert critical == [2, 2, 2]
-    values = [point.value for point in branch.points]
+    values = [point.value for point in branch.bifurcations]
     assert_allclose(values, [1.99, 2.0, 3.0], atol=1e-8)
 
 
@@ -329,7 +329,7 @@ def test_a_spike_that_an_earlier_maximum_reaches_first():
     rate = 2 * np.pi / period
     cycle = hj.find_limit_cycle(IntegrateAndFire())
     branch = hj.continuation(cycle, "a", (0.3, 0.8), step=0.1)
-    (fold,) = branch.points
+    (fold,) = branch.bifurcations
     charge = 1 / (1 - np.exp(-period))
     mean = charge - 1.5
     expected = abs(mean) * np.hypot(1, rate)
@@ -473,5 +473,5 @@ def test_a_branch_that_its_checks_cut_has_a_cause():
     branch = hj.continuation(cycle, "b", (1.99, 2.03), step=0.5)
     begin, end = branch.ends
     assert_allclose([begin.value, end.value], [2.0, 2.03], rtol=1e-6)
-    assert not branch.points
+    assert not branch.bifurcations
     assert "shrinks to an equilibrium" in begin.message

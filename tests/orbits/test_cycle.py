@@ -32,7 +32,7 @@ def test_the_hopper_and_its_events(reference, hopper_cycle):
     state = hopper_cycle.anchor.q[:2, 0]
     assert_allclose(state, half, atol=1e-10)
     assert hopper_cycle.result == hj.errors.Result.OK
-    assert hopper_cycle.stable
+    assert hopper_cycle.is_stable
     assert hopper_cycle.period == 1.0
     assert hopper_cycle.residual < 1e-12
     liftoff, touchdown = hopper_cycle.trajectory().events
@@ -117,7 +117,7 @@ def test_van_der_pol(mu):
     assert_allclose(cycle.multipliers, expected, rtol=1e-7, atol=0)
     assert not cycle.clocked
     assert cycle.event_sequence == ()
-    assert cycle.stable == (mu > 0)
+    assert cycle.is_stable == (mu > 0)
 
 
 def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
@@ -332,7 +332,7 @@ def test_damped_steps_reach_a_cycle_that_newtons_method_misses():
     assert_allclose(np.prod(cycle.multipliers), e**2, rtol=1e-9)
     traces = sum(np.sum(x.multipliers) for x in (cycle, stable))
     assert_allclose(traces, 2 * (1 + e**2), rtol=1e-9)
-    assert stable.stable
-    assert not cycle.stable
+    assert stable.is_stable
+    assert not cycle.is_stable
     assert ": ok, unstable)" in str(cycle)
     assert ": ok)" in str(stable)

@@ -33,7 +33,7 @@ def test_one_cycle_of_a_family(running):
     assert_allclose(running.period, 0.252532613817573, rtol=1e-11)
     assert_allclose(running.multipliers, [1, -0.161307631037475], rtol=1e-10)
     assert running.multipliers[0] == 1
-    assert running.stable
+    assert running.is_stable
     assert "(1: conserved energy)" in repr(running)
 
 

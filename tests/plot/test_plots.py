@@ -238,6 +238,40 @@ def test_bodes(estimate, exact, rational):
         hj.plot.bode(families, fits={"c": rational})
 
 
+def test_fits_are_drawn_beside_htfs_and_alone(hopper, estimate, structured):
+    """Also those of results, in lists and by name."""
+    beside = hj.plot.bode(estimate, structured).axes[0, 0]
+    same = hj.plot.bode(estimate, fits=structured).axes[0, 0]
+    for line, expected in zip(beside.get_lines(), same.get_lines(), strict=True):
+        assert_array_equal(line.get_xydata(), expected.get_xydata())
+        assert line.get_color() == expected.get_color()
+    assert list(labeled(beside)) == ["yM", "vM", "structured fit"]
+
+    design = hj.multisine(periods=16, frequencies=(0, 4.0)).realizations(2)
+    data = hj.experiments.simulate_experiments(hopper, design, start="periodic")
+    noisy = hj.experiments.add_noise(data, snr=60)
+    series = hj.fit_series(noisy, order=2, check=False)
+    upper = hj.plot.bode(series).axes[0, 0]
+    drawn = labeled(upper)["yM"]
+    f, size = drawn.get_xydata().T
+    assert (f[0], f[-1]) == (0, hopper.n_sections / 2)
+    assert_allclose(size, abs(series.htf(f, 0).H[0, :, 0, 0]), rtol=1e-9)
+    assert upper.collections, "a band"
+    families = {"model": hopper, "fit": series, "both": [estimate, series]}
+    upper = hj.plot.bode(families).axes[0]
+    titles = [panel.get_title() for panel in upper]
+    assert titles == ["model", "fit", "both"]
+    drawn = [x for x in upper[2].get_lines() if len(x.get_xdata())]
+    assert sum(x.get_color() == "black" for x in drawn) == 2
+    drawn = hj.plot.htf(series).ax.get_lines()[0]
+    assert_allclose(drawn.get_xydata().T, [f, size], rtol=1e-9)
+    for draw in (hj.plot.bode, hj.plot.htf):
+        with pytest.raises(hj.errors.DefinitionError, match="band of its data"):
+            draw(structured)
+        with pytest.raises(hj.errors.DefinitionError, match="band of its data"):
+            draw({"a": structured})
+
+
 # The complex plane
 
 

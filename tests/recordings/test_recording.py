@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings, strategies as st
 
 import hybridjax as hj
 from hybridjax.errors import FileFormatError
@@ -55,6 +56,98 @@ def test_trials_must_belong_together():
         hj.errors.DefinitionError, match="different signals: ..a', 'b'. and ..a"
     ):
         hj.Recording.join([one, hj.Recording(T, {"a": T})])
+
+
+@st.composite
+def recordings(draw):
+    """Recordings of trials with uneven times, gaps and events, and their clocks apart or shared."""
+    trials = []
+    for name in draw(st.sampled_from(["a", "ab", "abc"])):
+        steps = draw(st.lists(st.floats(0.01, 2.0), min_size=1, max_size=12))
+        time = draw(st.floats(-50.0, 50.0)) + np.cumsum([0.0, *steps])
+        values = np.where(np.arange(len(time)) % 5 == 3, np.nan, np.sin(time))
+        hits = np.array(draw(st.lists(st.floats(0.0, 1.0), max_size=6)))
+        trials.append(
+            hj.Recording(
+                time,
+                {"x": values, "f": np.arange(len(time))},
+                events={"hit": time[0] + hits * np.ptp(time)},
+                units={"f": "N"},
+                name=name,
+            )
+        )
+    return hj.Recording.join(trials)
+
+
+@settings(max_examples=60, deadline=None)
+@given(recordings(), st.floats(-60.0, 80.0), st.floats(-60.0, 80.0))
+def test_a_part_has_the_samples_and_events_between_two_times(whole, first, second):
+    start, stop = sorted((first, second))
+    assume(start < stop)
+    expected = []
+    for trial in whole.trials:
+        within = (trial.time >= start) & (trial.time < stop)
+        if within.sum() > 1:
+            expected.append((trial, within))
+    if not expected:
+        with pytest.raises(hj.errors.DefinitionError, match="less than two"):
+            whole.crop(start, stop)
+        return
+    part = whole.crop(start, stop)
+    assert (part.signals, part.units) == (whole.signals, whole.units)
+    for cropped, (trial, within) in zip(part.trials, expected, strict=True):
+        assert cropped.name == trial.name
+        np.testing.assert_array_equal(cropped.time, trial.time[within])
+        np.testing.assert_array_equal(cropped.values, trial.values[within])
+        hits = trial.events["hit"]
+        kept = cropped.events["hit"]
+        sure = (hits >= cropped.time[0]) & (hits <= cropped.time[-1])
+        assert set(hits[sure]) <= set(kept) <= set(hits)
+        assert ((kept >= start) & (kept < stop)).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(recordings(), st.floats(0.0, 1.0))
+def test_two_parts_side_by_side_have_all_samples(whole, share):
+    """Those of each trial, once, if two of them or more are left on both sides."""
+    low = max(trial.time[1] for trial in whole.trials)
+    high = min(trial.time[-2] for trial in whole.trials)
+    middle = low + share * (high - low)
+    assume(low < middle <= high)
+    both = hj.Recording.join([whole.crop(stop=middle), whole.crop(middle)])
+    n = len(whole)
+    for k, trial in enumerate(whole.trials):
+        parts = both.trials[k], both.trials[n + k]
+        time, values = (
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("time", "values")
+        )
+        np.testing.assert_array_equal(time, trial.time)
+        np.testing.assert_array_equal(values, trial.values)
+
+
+def test_parts_that_cannot_be():
+    whole = hj.Recording(T, GOOD, events={"hit": [0.5, 3.5]}, name="walk")
+    assert whole.crop().trials[0].events["hit"].tolist() == [0.5, 3.5]
+    assert whole.crop(0.6, 3.0).trials[0].events["hit"].tolist() == []
+    other = hj.Recording(100 + T, GOOD, name="run")
+    both = hj.Recording.join([whole, other])
+    assert [trial.name for trial in both.crop(50).trials] == ["run"]
+    for start, stop, message in (
+        (3.0, 1.0, "`start` must be before `stop`, not 3 and 1"),
+        (2.0, 2.0, "`start` must be before `stop`, not 2 and 2"),
+        (1.5, 2.5, "less than two samples .* lie in 0 to 4 s .'walk'., 100 to 104 s"),
+        (7, None, None),
+        (500, None, "less than two samples from 500 s on"),
+        (None, -1.0, "less than two samples before -1 s"),
+        ("a", None, "`start` must be a finite number"),
+        (np.nan, None, "`start` must be a finite number"),
+    ):
+        if message is None:
+            assert len(both.crop(start, stop)) == 1
+            continue
+        with pytest.raises(hj.errors.DefinitionError, match=message):
+            both.crop(start, stop)
 
 
 def test_csv_with_units_events_and_missing_samples(tmp_path):

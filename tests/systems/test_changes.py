@@ -113,7 +113,7 @@ def test_a_cycle_belongs_to_the_code_as_it_was(use, monkeypatch):
         match="the field of chart 'air' of Slowed has changed since",
     ):
         use(cycle)
-    assert hj.find_limit_cycle(Slowed(), cycle).stable  # (as a guess it will do)
+    assert hj.find_limit_cycle(Slowed(), cycle).is_stable  # (as a guess it will do)
 
 
 def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
@@ -265,7 +265,7 @@ LATER = {
         lambda cycle: (cycle.multipliers, cycle)[1],
         lambda x: x.multipliers,
     ),
-    "its stability": (lambda cycle: (cycle.stable, cycle)[1], lambda x: x.stable),
+    "its stability": (lambda cycle: (cycle.is_stable, cycle)[1], lambda x: x.is_stable),
     "its responses": (lambda cycle: cycle, lambda x: x.responses()),
     "its transfer functions": (lambda cycle: cycle, lambda x: x.htf(0.3)),
     "its sensitivity": (lambda cycle: cycle, lambda x: x.sensitivity("torque")),

@@ -41,7 +41,7 @@ def test_a_block_on_a_belt_sticks_and_slips():
     assert_allclose(cycle.period, period, rtol=1e-9)
     assert_allclose(cycle.state["x"], x, rtol=1e-9)
     assert len(cycle.multipliers) == 0
-    assert cycle.stable
+    assert cycle.is_stable
     names = [x.name for x in hj.models.BeltOscillator().transitions()]
     assert sorted(names[g] for g in cycle.event_sequence) == [
         "behind to sticks",

@@ -114,6 +114,7 @@ ATTRIBUTES = {
         ),
         "`fit.multipliers` and `fit.coefficients` have the numbers, and a function makes a new "
         "fit": "get_params set_params",
+        "`hj.plot.bode(htf, fit)` draws it over an HTF": "bode bode_plot nyquist",
         "a fit is made in one go, with the numbers in `fit.chi2_per_dof`": (
             "n_iter nfev n_iterations history"
         ),
@@ -134,12 +135,11 @@ ATTRIBUTES = {
         "`htf.variance` and `htf.standard_errors` have the errors": (
             "coherence coh mscohere"
         ),
-        "`abs(htf.H)` has it, and `hj.plot.bode(htf)` draws it": (
-            "magnitude gain mag db dcgain"
+        "`htf.magnitude` has it, and `hj.plot.bode(htf)` draws it": (
+            "gain mag db dcgain"
         ),
-        "`np.angle(htf.H)` has it, and `hj.plot.bode(htf)` draws it": "phase angle",
-        "`htf.H[:, :, htf.outputs.index('y')]` has those of an output, and "
-        "`htf.plot(outputs='y')` draws them": "output get_output sel_output",
+        "`htf.phase` has it in radians, and `hj.plot.bode(htf)` draws it": "angle",
+        "`htf['y']` is the HTF of an output": "output get_output sel_output",
         "`htf.select(0)` is the HTF of one harmonic, and `htf[0]` its values": (
             "harmonic eval evaluate evalfr at loc iloc sel isel"
         ),
@@ -184,9 +184,8 @@ ATTRIBUTES = {
         ),
     },
     "LDTP": {
-        "`hj.plot.bode(model.htf(frequencies))` draws it": (
-            "bode nyquist freqresp bode_plot frequency_response"
-        ),
+        "`hj.plot.bode(model)` draws it": "bode nyquist bode_plot",
+        "`model.htf(frequencies)` is the response": "freqresp frequency_response",
         "a model has `n_sections` samples in a period; time is not part of it": (
             "dt fs ts"
         ),
@@ -276,9 +275,12 @@ ATTRIBUTES = {
     "Recording": {
         "`hj.Recording(time[part], {name: recording[name][part]})` makes a recording of some "
         "signals or samples": (
-            "crop iloc loc drop_channels rename rename_channels drop pick_types reorder_channels "
-            "set_index select slice truncate cut split rename_signals add_channels set_units "
-            "pick_channels add_signal append_signal assign"
+            "drop_channels rename rename_channels drop pick_types reorder_channels set_index "
+            "select rename_signals add_channels set_units pick_channels add_signal append_signal "
+            "assign"
+        ),
+        "`recording.crop(start, stop)` returns the part between two times": (
+            "iloc loc slice truncate cut split trim between sel part"
         ),
         "`recording[name]` has the samples of a signal, `recording.to_pandas()` all signals": (
             "data get_data values x samples_array to_numpy"
@@ -344,13 +346,15 @@ ATTRIBUTES = {
         "durations": (
             "n_strides strides n_cycles cycles stride_time periods n_trials cadence step_times"
         ),
-        "`result.fit.htf(frequencies)` is the HTF": "htf bode transfer_function",
+        "`result.fit.htf(frequencies)` is the HTF": "htf transfer_function",
+        "`hj.plot.bode(result)` draws it": "bode bode_plot nyquist",
         "`result.held_out.validation` compares a fit with held-out cycles": (
             "validation score r2 rsquared rmse goodness cross_validation"
         ),
         "`result.fit` is the fit": "model params coef",
         "`hj.validate(result, data)` compares it with data, and `result.fit.htf(frequencies)` is "
-        "its response": "predict simulate residuals",
+        "its response": "predict simulate",
+        RESIDUALS: "residuals resid",
         "`hj.save(path, result.fit)` writes the fit, and `result.write_report(folder)` all": (
             "save export to_file dump"
         ),
@@ -361,9 +365,6 @@ ATTRIBUTES = {
         ),
         "`validation.whiteness` and `validation.independence` have the p values": (
             "pvalue ljung_box"
-        ),
-        "residuals are `validation.measured - validation.simulated`": (
-            "residuals resid"
         ),
     },
     "OrderSelection": {
@@ -413,7 +414,7 @@ ATTRIBUTES = {
         "`trajectory.t[-1]` is the last time": "t1 tf end duration t_final",
     },
     "Branch": {
-        "`branch.points` has them": "bifurcations special_points hopf folds",
+        "`branch.bifurcations` has them": "hopf folds flips",
     },
     "Population": {
         "`population.difference(quantity, a, b)` tests a difference, with p values": (

@@ -109,7 +109,7 @@ NAMES = {
         "use `hj.run_experiments(cycle, sections, design, outputs)`": (
             "run experiment perturb collect"
         ),
-        "use `hj.find_limit_cycle(system).stable`": "stability stable is_stable",
+        "use `hj.find_limit_cycle(system).is_stable`": "stability stable is_stable",
         "use `model.simulate(np.ones((n, nu)))`": (
             "step_response step_info step dstep"
         ),
@@ -190,7 +190,7 @@ NAMES = {
         "use `hj.continuation(cycle, parameter, (low, high))`": (
             "bifurcation bifurcation_diagram continue_cycle branch auto follow"
         ),
-        "use `branch.points`, of `hj.continuation(cycle, parameter, (low, high))`": (
+        "use `branch.bifurcations`, of `hj.continuation(cycle, parameter, (low, high))`": (
             "hopf hopf_points period_doubling fold limit_point neimark_sacker bifurcation_points"
         ),
         "equations are written as fields: `hj.HybridSystem.from_functions(states, field, "

@@ -20,8 +20,7 @@ KEYWORDS = {
         "`jax.grad` and `jax.jacfwd` differentiate, and need no options": (
             "adjoint jac jacobian gradient vectorized jac_sparsity"
         ),
-        "all cycles are used: `hj.Recording(time[part], {name: recording[name][part]})` makes a "
-        "part of a recording": (
+        "all cycles are used: `recording.crop(start, stop)` returns a part of a recording": (
             "tmin tmax crop max_cycles n_strides strides first_cycle last_cycle"
         ),
         "`hj.scale.enable_progress()` shows the progress": (

@@ -7,11 +7,6 @@ Tables for `leads.py`.
 from .sentences import AT_TIMES
 
 
-_OF_OUTPUT = (
-    "`htf.H[:, :, htf.outputs.index('y')]` has those of an output, and "
-    "`htf.plot(outputs='y')` draws them"
-)
-
 _OF_SAMPLES = (
     "`hj.fitting.ObservedTrajectory(hj.Guess(chart, state), times, outputs, values, input=push)` "
     "makes one of the samples of a recording"
@@ -217,8 +212,7 @@ OBJECTS = {
     "Branch.__getitem__.str": "`branch.values` has the values of the parameter, and "
     "`branch.to_pandas()` all numbers",
     "LimitCycle.trajectory.str": "`cycle.trajectory()('y')` has times and values of a signal",
-    "HTF.__getitem__.str": _OF_OUTPUT,
-    "HTF.select.str": _OF_OUTPUT,
+    "HTF.select.str": "`htf.select(outputs='y')` is the HTF of an output",
     "__getitem__.str": "an index is a number; of an HTF it is the harmonic",
     "multipliers.list": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
     "multipliers.dict": "`hj.plot.multipliers(true, {'fit': fit})` takes the true ones first",
@@ -227,8 +221,6 @@ OBJECTS = {
     "save.SectionData": "`data.to_pandas().to_csv(path)` writes it",
     "save.Identification": "save its `fit`, or write `result.write_report(folder)`",
     "save.NaturalIdentification": "save its `fit`, or write `result.write_report(folder)`",
-    "htf.StructuredFit": "draw HTFs: `hj.plot.htf(htf)`, or `fit.htf(frequencies)`",
-    "bode.StructuredFit": "draw HTFs: `hj.plot.bode(htf, fits=fit)`, or `fit.htf(frequencies)`",
     "simulate.LimitCycle": "`cycle.trajectory(periods)` follows a cycle",
     "to_pandas.HybridSystem": "print the system, or `hj.find_limit_cycle(system).to_pandas()`",
 }

@@ -25,10 +25,7 @@ EXPONENT = (
     "`hj.identify_recording(recording, ...)` or `hj.recordings.natural_multipliers(data)` "
     "estimates them"
 )
-RESIDUALS = (
-    "residuals are `validation.measured - validation.simulated`, of `validation = "
-    "hj.validate(fit, data)`"
-)
+RESIDUALS = "`validation.residuals` has them, of `validation = hj.validate(fit, data)`"
 MADE_OF_FUNCTIONS = (
     "`hj.HybridSystem.from_functions(('x', 'v'), field, events, {'k': 1.0})` makes a system of "
     "functions (t, q, u, p), with parameters `p.k`; `events` are [(name, guard, reset)]"
