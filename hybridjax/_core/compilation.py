@@ -495,6 +495,11 @@ def _identity_of_part(x: Any) -> Hashable:
     return None if _is_array(x) else (type(x), x)
 
 
+def numbers_of(trees: Any) -> list[Any]:
+    """The arrays of trees: what `identity` leaves out."""
+    return [x for x in jax.tree_util.tree_leaves(trees) if _is_array(x)]
+
+
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
     """x with `filled` lanes: its L lanes, then copies of the first."""
     if x.shape[-1] == 1:
