@@ -495,9 +495,10 @@ def _identity_of_part(x: Any) -> Hashable:
     return None if _is_array(x) else (type(x), x)
 
 
-def numbers_of(trees: Any) -> list[Any]:
-    """The arrays of trees: what `identity` leaves out."""
-    return [x for x in jax.tree_util.tree_leaves(trees) if _is_array(x)]
+def computation(trees: Any) -> tuple:
+    """All of trees, with the values of arrays: equal if the same is computed from the same."""
+    arrays = filter(_is_array, jax.tree_util.tree_leaves(trees))
+    return identity(trees), *(np.asarray(x).tobytes() for x in arrays)
 
 
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:

@@ -65,10 +65,6 @@ class Recent:
         self._kept.appendleft((owner, others, value))
         return value
 
-    def clear(self) -> None:
-        """Forget all values."""
-        self._kept.clear()
-
 
 class remembered:  # noqa: N801 (a decorator, as `property` is)
     """A property that is computed once for each object."""

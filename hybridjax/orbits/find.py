@@ -25,10 +25,9 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.compilation import identity, numbers_of, uncollected
+from .._core.compilation import computation, uncollected
 from .._core.executor import is_inside_program, is_traced, is_tracer, to_host
 from .._core.meaning import program_digest
-from .._core.memo import Recent
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result, update_result
@@ -75,7 +74,7 @@ from .scale import (
     sizes_on,
     stiff_charts,
 )
-from .verdict import verdict
+from .verdict import keep_verdict, verdict
 
 
 # Sizes are estimated before the cycle is known. If an estimate was too large by more than this
@@ -90,8 +89,10 @@ _LATEST = 40
 # Periods within which an event is chosen as the section, in place of a plane. Fewer: rare events
 # are missed. More: time.
 _EVENTFUL = 8
-# The cycles that searches from states have found, for calls that are repeated. More: memory.
-_found = Recent(16)
+# Number of cycles that searches from states have found, and that calls with the same arguments are
+# given. More: memory. Fewer: cells of a notebook that are run again search again.
+_REMEMBERED = 16
+_found: dict[tuple, LimitCycle] = {}
 # Results of a search that has found a cycle (an isolated one, or one of a family); and results
 # after which the search begins again from a later state.
 _FOUND = Result.OK, Result.SINGULAR
@@ -277,20 +278,35 @@ def _once(
     """
     if is_inside_program() or not program_digest(system):
         return search()
-    asked = identity((system, arguments))
-    numbers = numbers_of((system, arguments))
-    found = _found.get(find_limit_cycle, asked, numbers)
+    asked = computation((system, arguments))
+    found = _found.pop(asked, None)
     if found is None:
         cycle = search()
         if int(cycle.result) == Result.OK:
-            _found.keep(cycle, find_limit_cycle, asked, numbers)
+            _remember(asked, _copy(cycle, system))
         return cycle
-    same = jax.tree_util.tree_structure
-    if same(found.system) == same(system):
-        return found
-    # (Its outputs and drawings may be others, which the search does not compute.)
-    own = dataclasses.replace(found, system=system, numbers=copies_of(system))
-    return remembering(own, found)
+    _remember(asked, found)
+    return _copy(found, system)
+
+
+def _remember(asked: tuple, cycle: LimitCycle) -> None:
+    _found[asked] = cycle
+    if len(_found) > _REMEMBERED:
+        oldest = next(iter(_found))
+        _found.pop(oldest, None)
+
+
+def _copy(cycle: LimitCycle, system: HybridSystem) -> LimitCycle:
+    """The cycle with arrays of its own, since users may let JAX write over those that they have; of
+    a system that computes the same (its outputs and drawings may be others)."""
+
+    def copied(x: Any) -> Any:
+        return jax.device_put(np.array(x)) if isinstance(x, jax.Array) else x
+
+    other = jax.tree_util.tree_map(copied, cycle)
+    other = dataclasses.replace(other, system=system, numbers=copies_of(system))
+    keep_verdict(other, cycle)
+    return remembering(other, cycle)
 
 
 class _Request(NamedTuple):

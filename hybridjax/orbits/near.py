@@ -68,7 +68,7 @@ _DERIVATIVES_WORTH_COMPILING = 24
 _routes = Memory()
 _beside = Memory()
 _calls: collections.Counter = collections.Counter()
-_searching: collections.Counter = collections.Counter()
+_searching: dict[tuple, float] = collections.defaultdict(float)
 
 
 def route_near(guess: LimitCycle) -> Route | None:

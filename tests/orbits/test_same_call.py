@@ -1,6 +1,7 @@
 """`find_limit_cycle` with the arguments of an earlier call, as in a cell of a notebook that is run
 again: the cycle is remembered if nothing that it depends on has changed."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -117,7 +118,7 @@ def test_a_class_that_is_defined_again_keeps_its_own_outputs(searches):
         assert type(cycle.system) is type(system)
         _, values = cycle.trajectory()(name)
         assert_allclose(values, 1.0, rtol=0, atol=1e-6)  # (an interpolation)
-    assert len(searches) == 1
+    assert len(searches) == 2
 
 
 def test_a_search_that_fails_is_searched_again(searches):
@@ -135,10 +136,24 @@ def test_few_cycles_near_a_known_one_are_not_worth_compiling(monkeypatch):
 
     cycle = hj.find_limit_cycle(hj.models.VanDerPol(mu=1.0))
     monkeypatch.setattr(near, "whole", compiles)
-    monkeypatch.setattr(near, "_searching", near.collections.Counter())
+    monkeypatch.setattr(near, "_searching", near.collections.defaultdict(float))
     for mu in (1.01, 1.02, 1.03, 1.04):
         near_it = hj.find_limit_cycle(hj.models.VanDerPol(mu=mu), cycle)
         assert near_it.result == hj.errors.Result.OK
     monkeypatch.setattr(near, "_WORTH_COMPILING", 0.0)
     with pytest.raises(AssertionError, match="a program is compiled"):
         hj.find_limit_cycle(hj.models.VanDerPol(mu=1.05), cycle)
+
+
+def test_calls_share_no_numbers(searches):
+    """A user may let JAX write over the numbers of one cycle, and has the other still."""
+    first = circle()
+    given = circle()
+    held = [x for x in jax.tree_util.tree_leaves(given) if isinstance(x, jax.Array)]
+    assert held
+    for x in held:
+        x.delete()
+    for cycle in (first, circle()):
+        assert_allclose(cycle.period, 2 * np.pi, rtol=0, atol=1e-10)
+        assert_allclose(cycle.multipliers, np.exp(-4 * np.pi), rtol=1e-6)
+    assert len(searches) == 1
