@@ -44,6 +44,7 @@ import pytest
 import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.execution import libraries
+from hybridjax.orbits import find
 
 
 # Files whose fast tests cover each capability once, for `-m core`.
@@ -154,6 +155,17 @@ def forget_programs():
 
 
 @pytest.fixture(autouse=True)
+def forget_cycles(request):
+    """Of other tests, where a test replaces parts of the package."""
+    patched = "monkeypatch" in request.fixturenames
+    if patched:
+        find._found.clear()
+    yield
+    if patched:
+        find._found.clear()
+
+
+@pytest.fixture(autouse=True)
 def figures_are_closed():
     yield
     if "matplotlib.pyplot" in sys.modules:
@@ -172,6 +184,7 @@ def compiled():
             names.add(re.sub(r"^jit\(|_[0-9a-f]{32}|\)$", "", fun_name))
 
     compilation.WORTH_COMPILING = np.inf
+    find._found.clear()
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         yield names

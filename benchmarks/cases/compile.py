@@ -15,8 +15,9 @@ parameters, in reverse mode and outside of `jit`, and a fit of two parameters to
 second of each. `responses`: the first `cycle.responses()` of the hopper and of a neuron, and the
 hopper's `cycle.htf` at 620 frequencies again. `cycles`: `find_limit_cycles` of 50 x 50 hoppers, and
 the same by the sweep in C (`c`; `times_c`: as multiples of it). `sweep`: `hj.sweep` of the same;
-`branch`: README's continuation; each a second time. `repeats`: `find_limit_cycle` from a known
-cycle after a small change of a parameter, when four such calls have gone before. `in_program`:
+`branch`: README's continuation; each a second time. `repeats`: `find_limit_cycle` with
+the arguments of an earlier call (`same`), and from a known cycle after a small change of a
+parameter: an early call, the call that compiles, and a later one. `in_program`:
 inside of `jit`, the gradient of the square of the monodromy's trace by the hopper's nine
 parameters; `linearized`: that of the matrices between sections; `..._quick`: with an option of the
 compiler. `neurons`, `bucks`, `compasses`: `find_limit_cycles` of 2500 of each (`found`: the
@@ -300,7 +301,8 @@ def walkers() -> dict[str, float]:
 
 
 def repeats() -> dict[str, float]:
-    """CPU seconds of cycles near known ones, with new values of a parameter, after four others."""
+    """CPU seconds of the same call again, and of cycles near known ones with new values of a
+    parameter: of the first calls, which search, and of later ones, which are compiled."""
     import hybridjax as hj
 
     hj.enable_x64()
@@ -312,13 +314,18 @@ def repeats() -> dict[str, float]:
     }
     for name, (make, parameter, value) in cases.items():
         cycle = hj.find_limit_cycle(make())
+        begin = time.process_time()
+        hj.find_limit_cycle(make())
+        seconds[f"{name}.same"] = time.process_time() - begin
         calls = []
-        for i in range(1, 10):
+        for i in range(1, 80):
             system = make(**{parameter: value * (1 + 1e-4 * i)})
             begin = time.process_time()
             hj.find_limit_cycle(system, cycle)
             calls.append(time.process_time() - begin)
-        seconds[name] = min(calls[4:])
+        seconds[f"{name}.first"] = calls[1]
+        seconds[f"{name}.compiling"] = max(calls)
+        seconds[f"{name}.later"] = min(calls[-4:])
     return seconds
 
 

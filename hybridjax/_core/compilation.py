@@ -495,6 +495,12 @@ def _identity_of_part(x: Any) -> Hashable:
     return None if _is_array(x) else (type(x), x)
 
 
+def computation(trees: Any) -> tuple:
+    """All of trees, with the values of arrays: equal if the same is computed from the same."""
+    arrays = filter(_is_array, jax.tree_util.tree_leaves(trees))
+    return identity(trees), *(np.asarray(x).tobytes() for x in arrays)
+
+
 def _fill(x: np.ndarray, L: int, filled: int) -> np.ndarray:
     """x with `filled` lanes: its L lanes, then copies of the first."""
     if x.shape[-1] == 1:

@@ -16,7 +16,8 @@ errors are measured (`scale.py`).
 """
 
 import dataclasses
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -24,8 +25,9 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.compilation import uncollected
+from .._core.compilation import computation, uncollected
 from .._core.executor import is_inside_program, is_traced, is_tracer, to_host
+from .._core.meaning import program_digest
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result, update_result
@@ -36,7 +38,7 @@ from ..errors import ComputationError, DefinitionError
 from ..systems.check import check_system
 from ..systems.quotient import check_symmetry
 from ..systems.solver import Radau
-from ..systems.start import StateLike, SystemLike, guess_of, system_of
+from ..systems.start import StateLike, SystemLike, guess_of, own_guess, system_of
 from ..systems.structure import Structure
 from ..systems.system import Guess, HybridSystem, arrays_of, copies_of, integrated
 from . import checks
@@ -52,7 +54,13 @@ from .guess import (
     return_map_near,
 )
 from .linear_flow import keep_turn, last_turn, remembering
-from .near import derived_cycle, repeated_cycle, route_near, traced_cycle
+from .near import (
+    derived_cycle,
+    note_search,
+    repeated_cycle,
+    route_near,
+    traced_cycle,
+)
 from .newton import Solution, search, solve
 from .periodic import has_period
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
@@ -66,7 +74,7 @@ from .scale import (
     sizes_on,
     stiff_charts,
 )
-from .verdict import verdict
+from .verdict import keep_verdict, verdict
 
 
 # Sizes are estimated before the cycle is known. If an estimate was too large by more than this
@@ -81,6 +89,10 @@ _LATEST = 40
 # Periods within which an event is chosen as the section, in place of a plane. Fewer: rare events
 # are missed. More: time.
 _EVENTFUL = 8
+# Number of cycles that searches from states have found, and that calls with the same arguments are
+# given. More: memory. Fewer: cells of a notebook that are run again search again.
+_REMEMBERED = 16
+_found: dict[tuple, LimitCycle] = {}
 # Results of a search that has found a cycle (an isolated one, or one of a family); and results
 # after which the search begins again from a later state.
 _FOUND = Result.OK, Result.SINGULAR
@@ -226,27 +238,75 @@ def find_limit_cycle(
     _check_section(s, section)
     if not traced:
         checks.check_clock(s)
-    known: LimitCycle | None = None
     if isinstance(guess, LimitCycle):
-        known = guess
-        _check_fits(known, s, multiplicity, bool(settle) or max_period is not None)
-        map = _map_near_cycle(known, s, section, settings, given)
-        conserved = known.conserved if conserved is None else conserved
-    elif traced:
+        _check_fits(guess, s, multiplicity, bool(settle) or max_period is not None)
+        map = _map_near_cycle(guess, s, section, settings, given)
+        values = guess.conserved if conserved is None else conserved
+        map = dataclasses.replace(map, conserved=_numbers(values))
+        request = _Request(map, guess, section, given, patient, settle, throw)
+        return _near_cycle(request, guess, traced)
+    if traced:
         raise DefinitionError(
             "under a JAX transformation find_limit_cycle needs a LimitCycle as its guess: find "
             "one outside, and pass it as `guess`."
         )
-    else:
-        map = return_map_near(
-            s, guess, section, multiplicity or 1, settle, max_period, settings, given
-        )
-    values = {name: real(value) for name, value in (conserved or {}).items()}
-    map = dataclasses.replace(map, conserved=values)
-    request = _Request(map, known, section, given, patient, settle, throw)
-    if known is None:
+    guess = own_guess(system) if guess is None else guess
+    begin = guess, section, multiplicity or 1, settle, max_period, settings, given
+    values = _numbers(conserved or {})
+
+    def search() -> LimitCycle:
+        map = return_map_near(s, *begin)
+        map = dataclasses.replace(map, conserved=values)
+        request = _Request(map, None, section, given, patient, settle, throw)
         return _from_guess(request)
-    return _near_cycle(request, known, traced)
+
+    return _once(system, (begin, values, patient), search)
+
+
+def _numbers(conserved: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: real(value) for name, value in conserved.items()}
+
+
+def _once(
+    system: HybridSystem, arguments: tuple, search: Callable[[], LimitCycle]
+) -> LimitCycle:
+    """The cycle that a search finds. If it has found one for an equal system and equal arguments,
+    that cycle is returned.
+
+    Systems are equal if they compute the same, also if they are of a class that was defined again,
+    as by a cell of a notebook that is run again (see `meaning.py`).
+    """
+    if is_inside_program() or not program_digest(system):
+        return search()
+    asked = computation((system, arguments))
+    found = _found.pop(asked, None)
+    if found is None:
+        cycle = search()
+        if int(cycle.result) == Result.OK:
+            _remember(asked, _copy(cycle, system))
+        return cycle
+    _remember(asked, found)
+    return _copy(found, system)
+
+
+def _remember(asked: tuple, cycle: LimitCycle) -> None:
+    _found[asked] = cycle
+    if len(_found) > _REMEMBERED:
+        oldest = next(iter(_found))
+        _found.pop(oldest, None)
+
+
+def _copy(cycle: LimitCycle, system: HybridSystem) -> LimitCycle:
+    """The cycle with arrays of its own, since users may let JAX write over those that they have; of
+    a system that computes the same (its outputs and drawings may be others)."""
+
+    def copied(x: Any) -> Any:
+        return jax.device_put(np.array(x)) if isinstance(x, jax.Array) else x
+
+    other = jax.tree_util.tree_map(copied, cycle)
+    other = dataclasses.replace(other, system=system, numbers=copies_of(system))
+    keep_verdict(other, cycle)
+    return remembering(other, cycle)
 
 
 class _Request(NamedTuple):
@@ -348,7 +408,10 @@ def _near_cycle(request: _Request, known: LimitCycle, traced: bool) -> LimitCycl
             if map.conserved:
                 checks.check_conserved(cycle)
             return cycle
-    return _searched(request)
+    begin = time.thread_time()
+    cycle = _searched(request)
+    note_search(known, map, time.thread_time() - begin)
+    return cycle
 
 
 def _traced_without_route(known: LimitCycle, map: ReturnMap) -> LimitCycle:

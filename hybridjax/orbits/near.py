@@ -58,15 +58,17 @@ from .rivals import coincide_on
 from .verdict import verdict
 
 
-# Number of calls for systems of one class after which the program is compiled. Fewer: programs are
-# compiled and never used again. More: repeated calls stay slow for longer.
-_WORTH_COMPILING = 3
-# The same number for derivatives outside of programs: compilation takes as long as this many
-# derivatives on the host.
+# Seconds that searches near known cycles of one class take in all before the program is compiled:
+# about as long as compiling takes. Less: who changes a constant a few times waits for a program
+# that is hardly used. More: repeated calls stay slow for longer.
+_WORTH_COMPILING = 4.0
+# Number of derivatives outside of programs after which their program is compiled, which takes as
+# long as these. Fewer: the same wait. More: derivatives stay slow for longer.
 _DERIVATIVES_WORTH_COMPILING = 24
 _routes = Memory()
 _beside = Memory()
 _calls: collections.Counter = collections.Counter()
+_searching: dict[tuple, float] = collections.defaultdict(float)
 
 
 def route_near(guess: LimitCycle) -> Route | None:
@@ -230,16 +232,25 @@ def _coincide(route: Route, map: ReturnMap, passage: Passage):
     return (together & ~route.together).any()
 
 
+def _kind(route: Route, map: ReturnMap) -> tuple:
+    """What a program is compiled for."""
+    return route.first.form, identity((map,))
+
+
+def note_search(guess: LimitCycle, map: ReturnMap, seconds: float) -> None:
+    """Remember how long a search near a known cycle has taken, for `repeated_cycle`."""
+    route = route_near(guess)
+    if route is not None:
+        _searching[_kind(route, map)] += seconds
+
+
 def repeated_cycle(guess: LimitCycle, map: ReturnMap) -> LimitCycle | None:
     """The cycle of a return map near a known cycle. None if a search is needed: the cycle leaves
     the route, Newton's method does not converge, or the program is not compiled yet."""
     route = route_near(guess)
     if route is None:
         return None
-    form = route.first.form
-    key = form, identity((map,))
-    _calls[key] += 1
-    if _calls[key] < _WORTH_COMPILING:
+    if _searching[_kind(route, map)] < _WORTH_COMPILING:
         return None
     begin = [np.asarray(x) for x in _beginning(route, map)]
     t = np.asarray(map.anchor.t[0])

@@ -173,6 +173,13 @@ def verdict(cycle) -> Verdict:
     return _verdicts.recall(cycle, None, lambda: _verdict(cycle))
 
 
+def keep_verdict(cycle, other) -> None:
+    """Remember with a cycle what is known of `other`, which is the same cycle."""
+    known = _verdicts.get(hosted(other), None)
+    if known is not None:
+        _verdicts.recall(hosted(cycle), None, lambda: known)
+
+
 def visits_of(cycle) -> list[Visit]:
     """The visits of charts on a cycle."""
     cycle = hosted(cycle)

@@ -97,7 +97,7 @@ def free():
 @pytest.fixture
 def compiled(monkeypatch):
     """Calls follow itineraries from the first one on."""
-    monkeypatch.setattr(near, "_WORTH_COMPILING", 1)
+    monkeypatch.setattr(near, "_WORTH_COMPILING", 0.0)
 
 
 def amplitude(drive):
