@@ -1,5 +1,7 @@
 """Cycles modulo a symmetry: the walker in full, with two legs that have names and a place."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -79,6 +81,15 @@ class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
         return hj.Guess("left stands", state)
 
 
+class OneSided(Full):
+    """Legs land under different conditions."""
+
+    def transitions(self):
+        left, right = super().transitions()
+        yield left
+        yield dataclasses.replace(right, enabled=lambda t, q, u: q[1] > 0)
+
+
 FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})
 PLACED = type("Placed", (Full,), {"outputs": lambda self: [FAR]})()
 PARTNERS = {"left": "right", "left_rate": "right_rate"}
@@ -114,6 +125,11 @@ def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section
             Full(early=0.1),
             MIRROR,
             "'left lands' is not the mirror image of .* 'right lands'",
+        ),
+        (
+            OneSided(),
+            MIRROR,
+            "`enabled` of transition 'left lands' is not the mirror image",
         ),
     ],
 )
