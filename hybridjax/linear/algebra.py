@@ -176,9 +176,12 @@ class Lines(NamedTuple):
         K, N = self.row.shape
         ny = matrices.shape[1] // N
         values = matrices.reshape(K, N, ny, N, -1).swapaxes(2, 3)
+        # Class k and column b in which each line stands first.
         _, first = np.unique(self.row, return_index=True)
         k, b = np.unravel_index(first, self.row.shape)
         mirrored = self.mirrored[k, b]
+        # H_m stands m rows below the diagonal; of a line that stands for its mirror image -f, it is
+        # the conjugate of H_-m.
         m = np.arange(N)[:, None] - N // 2
         a = (b + np.where(mirrored, -m, m)) % N
         values = values[k, a, b]

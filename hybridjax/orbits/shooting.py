@@ -91,8 +91,8 @@ def fixed_point(
         t = moves.t + shift[:, 0]
         q = moves.q + moved.T
         moves = moves._replace(t=t, q=q, h=h)
-        # (Newton's method converges quadratically: after a step, the error is about the square of
-        # the step.)
+        # (Newton's method converges quadratically: after a step as short as this, the error is
+        # about its square, and no further step is needed.)
         rtol = np.asarray(map.settings.rtol)
         if length <= np.maximum(CLOSED, rtol):
             return x, _forwards(moves)
@@ -102,12 +102,13 @@ def fixed_point(
 def _shift(
     map: ReturnMap, moves: Moves, x: Float[np.ndarray, " d"], target: Target
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "M n"], Float[np.ndarray, " M"]]:
-    """One Newton step: of the state at the anchor (in sizes), of (t, q) at the starts of moves, so
-    that the gaps between moves close, and of the lengths of moves."""
+    """One Newton step so that the gaps between moves close: the changes of the state at the anchor
+    (in sizes), and of (t, q) at the starts of moves; and the lengths of moves after it."""
     n = 1 + len(x)
     end, by = linear_moves(map.structure, moves, target)
     by_point = by[:, :, :n]
     starts = np.concatenate([moves.t[None], moves.q]).T
+    # (After the last move there is no start: its whole end is wanted.)
     between = end[:-1] - starts[1:]
     gaps = np.concatenate([between, end[-1:]])
     late = map.anchor.t[0] - starts[0, 0]
