@@ -169,8 +169,8 @@ class TrottingQuadruped(TwoLeggedBar):
     order has a derivative of its own (`cycle.simultaneous_events()`), and `find_limit_cycle`
     raises an error that reports this.
 
-    The body on springy legs is that of `TwoLeggedBar`. Events that coincide on its cycle make the flow
-    piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
+    The body on springy legs is that of `TwoLeggedBar`. Events that coincide on its cycle make the
+    flow piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
     Event-selected vector field discontinuities yield piecewise-differentiable flows, SIAM J.
     Applied Dynamical Systems 15, 2016.
     """

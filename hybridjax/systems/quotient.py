@@ -246,17 +246,20 @@ class Symmetric(Derived):
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """Return the picture of the original system at the translation 0. Its
         `velocity` is the speed of the translation."""
-        whole = self.system.charts()[chart]
-        still = dict.fromkeys(self.translation, 0.0)
         time = q["clock"] if self.charts()[chart].clocked else t
-        drawing = self.system.draw(chart, time, {**q, **still})
+        states = {**q, **dict.fromkeys(self.translation, 0.0)}
+        drawing = self.system.draw(chart, time, states)
         if drawing is None or len(self.translation) != 1:
             return drawing
-        values = {**still, **q}
-        state = jnp.stack([jnp.asarray(values[x], float) for x in whole.states])
-        rates = as_vector(whole.field(t, state, jnp.zeros(len(self.inputs))))
-        along = rates[whole.states.index(self.translation[0])]
-        return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
+        speed = self._speed(chart, time, states)
+        return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([speed, 0 * speed]))
+
+    def _speed(self, chart: str, time: Any, states: Mapping[str, Any]):
+        """The rate of the only translated state, without inputs."""
+        whole = self.system.charts()[chart]
+        q = jnp.stack([jnp.asarray(states[x], float) for x in whole.states])
+        rates = as_vector(whole.field(time, q, jnp.zeros(len(self.inputs))))
+        return rates[whole.states.index(self.translation[0])]
 
     def whole(self, at: Guess) -> tuple[HybridSystem, Guess] | None:
         """With `half_period`: the original system, whose cycle has both halves, and the given state
