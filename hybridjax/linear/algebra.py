@@ -5,6 +5,10 @@ $w = K z + L r$ and $y = M z$ connect them.
 
 HTFs are matrices, one for each class of frequencies f + integers: components of the input at
 f + b become components of the output at f + a by $H(f)[a, b] = H_{a-b}(f + b)$, indices modulo N.
+
+`LDTP` and `HTF` call these functions. If a connection of systems is wrong, look at `connect`; if
+that of HTFs is, at `Lines` (which line stands where), then at the operation; if only variances are,
+at the pairs (G, H) that the operation returns.
 """
 
 from collections.abc import Callable
