@@ -8,7 +8,10 @@ from .branches import (
 from .coincidence import (
     SimultaneousEvents as SimultaneousEvents,
 )
-from .coupling import Coupling as Coupling, Locked as Locked
+from .coupling import (
+    Coupling as Coupling,
+    Locked as Locked,
+)
 from .cycle import LimitCycle as LimitCycle
 from .flow import Flow as Flow
 from .fluctuations import Fluctuations as Fluctuations
