@@ -17,7 +17,7 @@ from peers.errors import Unavailable
 
 import hybridjax as hj
 from hybridjax.experiments import run as batched
-from hybridjax.experiments.response import course, flow_batch
+from hybridjax.experiments.response import Course, flow_batch
 from hybridjax.experiments.run import RunOptions, prepare
 from hybridjax.sections.placed import PlacedSections
 from hybridjax.systems.system import own_fields
@@ -108,7 +108,7 @@ class Problem:
 
 def responding(placed, plan, start, u, outputs, settings):
     """Outputs (S, n, 2) of experiments, to be differentiated."""
-    return flow_batch(course(placed, outputs), plan, start, u, settings).y
+    return flow_batch(Course.of(placed, outputs), plan, start, u, settings).y
 
 
 program = eqx.filter_jit(responding)

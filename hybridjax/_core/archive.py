@@ -2,7 +2,13 @@
 
 One array per array field, named like the field (`outer.inner` where a field is a module itself),
 and the array `header`. Nothing in a file is ever executed: there is no pickle, and a reader builds
-only the kinds that it asks for, by their own checked constructors.
+only the kinds that it asks for, by their own checked constructors. All of this must stay so, since
+files come from anywhere.
+
+`hj.save` and `hj.load` call `write_module` and `read_module`. `taken_apart` and `put_together` are
+inverse to each other: a change of one needs one of the other, and `_VERSION` one more if old files
+can no longer be read. If a result cannot be saved, compare its fields with their annotations
+(`_matches`); if a good file is refused, look at `_read_header`, `_check_sizes` and `_array`.
 """
 
 import dataclasses

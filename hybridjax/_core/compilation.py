@@ -8,6 +8,10 @@ each array; the host is this process's Python with NumPy, in place of a compiled
 - `Program` compiles experiments: with few optimizations, or for loops that run many times.
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
   do more at once.
+
+Options change the time, and results by rounding only. If a program is compiled again without need,
+look at `kind` and `identity`, by which programs are found again; if a function stays slow, at
+`WORTH_COMPILING` in `host_first`.
 """
 
 import collections

@@ -1,4 +1,10 @@
-"""How many cores a computation uses: compiled calls in threads, and BLAS in one."""
+"""How many cores a computation uses: compiled calls in threads, and BLAS in one.
+
+Batches of experiments and of cycles call `in_threads`, large operations of NumPy `on_all_cores`.
+Threads of BLAS would compete with these: `one_blas_thread` switches them off for the whole process
+and counts how often it was entered, so that the last exit restores them. If a call is slow on many
+cores, look whether `libraries` finds the OpenBLAS of NumPy and SciPy; others are left as they are.
+"""
 
 import contextlib
 import ctypes

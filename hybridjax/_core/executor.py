@@ -9,6 +9,10 @@ for a few lanes.
 There is no other switch between the two than the type of the arrays. `namespace` returns the
 library that belongs to an array, and the functions here do whatever NumPy and JAX write
 differently.
+
+If values on the host and in programs differ, look for a function of NumPy or JAX that `namespace`
+does not cover, and add it here. If a program is traced where values were expected, look at
+`is_traced` and `is_hidden`.
 """
 
 import contextlib

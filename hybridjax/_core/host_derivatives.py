@@ -1,4 +1,14 @@
-"""Derivatives of compiled functions that come from the host, outside of programs."""
+"""Derivatives of compiled functions that come from the host, outside of programs.
+
+A function of `by_columns` is compiled by JAX, but has a rule for its derivatives: outside of
+programs and for few numbers, `along` computes them on the host, which needs no compilation of the
+derivative. Inside of programs, and where `along` raises `NotOnHostError`, JAX derives the compiled
+function. Both must give the same numbers: compare them first if a derivative is wrong.
+`only_on_host` turns the second way into an error, for callers that would rather do without.
+
+If a derivative is compiled without need, look at the conditions in `rule`: hidden values, or more
+than `most` numbers that move.
+"""
 
 import contextlib
 import contextvars

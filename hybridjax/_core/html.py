@@ -2,6 +2,9 @@
 
 All texts, names of users among them, are escaped here. Text and axes are drawn in the current color
 on no background, so that both light and dark themes can be read.
+
+If a page breaks, look whether its text goes through `text`, `facts` or `table`, which escape; if a
+picture is empty, at `picture`.
 """
 
 import io

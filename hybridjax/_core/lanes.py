@@ -4,6 +4,9 @@ A lane is one of many states that a program computes at once; lanes stand on the
 array. An argument that all lanes share (a system's parameters, say) is passed as it is. One that
 differs from lane to lane is marked by `PerLane`. Called by the engine, systems, sections and
 orbits.
+
+If derivatives are right for one lane and wrong for several, look at `lane_jvp`; if `jax.vmap` gives
+other values than a loop, at `vmap_to_lanes` and `_join`.
 """
 
 import functools as ft

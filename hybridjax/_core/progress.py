@@ -2,6 +2,9 @@
 
 The line is shown in terminals and in Jupyter, not in logs, pipes and tests. There a report of
 progress costs next to nothing.
+
+`working` marks a call, `counted` and `say` its step. If a line stays or is missing, look at `_keep`
+(its thread) and `_is_watched` (where it is shown).
 """
 
 import contextlib

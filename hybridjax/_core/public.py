@@ -3,6 +3,10 @@
 The `__init__.pyi` of a namespace lists its public names. Each name is imported when it is first
 used (PEP 562), and type checkers read the same list. The `__init__.py` of each namespace calls
 `attach`.
+
+A new public name is a line in the `__init__.pyi` of its namespace; a name that was renamed, a line
+in the tables here. If a name is not found, look at `_homes`; if an error leads to the wrong name,
+at `about_name`.
 """
 
 import ast

@@ -1,9 +1,18 @@
-"""Base classes of results: `Showable`, with what each result can do in a notebook and in print; and
-the one for results that have multipliers.
+"""Base classes of results: `Showable`, with `plot`, `to_pandas` and `findings`, and
+`WithMultipliers`, for results that have Floquet multipliers.
+
+A new type of result gets a function in `convert/tables.py`, a figure in `plot/first.py` or
+`plot/first_of_data.py`, and a line in the list of `to_pandas` here. If a table or a figure is
+wrong, look at its function in those files.
+
+If attributes or methods of a result misbehave, look at `boundary/members.py`, whose functions are
+put into the classes here: an attribute that does not exist raises an error that leads on
+(`missing_attribute`), results cannot be changed (`fixed_attribute`), and a public method prints how
+to call it (`bind_methods`).
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -15,15 +24,17 @@ from .findings import Finding
 class Showable:
     """A result that can be drawn and put in a table, and that lists the reasons to doubt it.
 
-    A result of several steps may name fields in `_stands_for`: functions that take such an object
-    take the result, too, and use the field.
-
     **Fields:** `findings`, reasons to doubt the result; empty where there are none, or where the
     step that made it does not look for any.
     """
 
+    _stands_for: ClassVar[tuple[str, ...]] = ()
+    """Fields that functions use if they are given this result. With ("fit", "data"), a function
+    that needs a fit takes the result and uses its `fit` (`boundary/containers.py`)."""
+
     if TYPE_CHECKING:
-        # (A field of some results, and a property of others: neither can be declared for all.)
+        # (A field of some results, and a property of others: neither can be declared for all. For
+        # the same reason, checkers of types do not see the default.)
         @property
         def findings(self) -> tuple[Finding, ...]: ...
     else:
@@ -51,7 +62,7 @@ class Showable:
         htf.plot(outputs="yM").save("htf.pdf")
         ```
         """
-        # (By name: results know nothing of figures, which import all of them.)
+        # (Imported by name, as figures import the results.)
         first = importlib.import_module("hybridjax.plot.first")
         return first.draw(self, *args, **options)
 
@@ -93,11 +104,12 @@ class Showable:
         print(data.to_pandas().head())
         ```
         """
-        # (By name: results know nothing of tables, which import all of them.)
+        # (Imported by name, as tables import the results.)
         tables = importlib.import_module("hybridjax.convert.tables")
         return tables.to_pandas(self)
 
 
+# (`__init_subclass__` is called for the classes that inherit, and not for `Showable` itself.)
 bind_methods(Showable)
 
 
@@ -105,7 +117,7 @@ class WithMultipliers(Showable):
     """A result that has Floquet multipliers."""
 
     if TYPE_CHECKING:
-        # (As `findings`.)
+        # (A field of some results, and a property of others, as `findings`.)
         @property
         def multipliers(self) -> Any: ...
 

@@ -1,4 +1,10 @@
-"""What objects print: numbers with units, arrays by shape and range, modules by their fields."""
+"""What objects print: numbers with units, arrays by shape and range, modules by their fields.
+
+Most `__repr__` of the package call these functions, each of which is alone. The constants set how
+much is shown, and tests compare printed texts. If a number has too many or too few digits, look at
+`rounded`, `standard_error` and `number`; if lines break badly, at `folded`; if a field is shown
+badly, at `value` and `_array`.
+"""
 
 import dataclasses
 import re
@@ -124,7 +130,7 @@ def standard_error(error: Any) -> str:
 
 
 def _exponent(x: Any) -> int:
-    """The power of ten of the first digit, of two."""
+    """The power of ten of the first digit of a number that is rounded to two digits."""
     return int(f"{x:.1e}".partition("e")[2])
 
 
@@ -162,8 +168,8 @@ def fields(self: Any) -> str:
     line = ", ".join(shown)
     if len(kind) + len(line) + 2 <= _WIDTH:
         return f"{kind}({line})"
-    folded = [textwrap.fill(x, _WIDTH - 3, subsequent_indent="  ") for x in shown]
-    inside = textwrap.indent(",\n".join(folded), "  ")
+    lines = [textwrap.fill(x, _WIDTH - 3, subsequent_indent="  ") for x in shown]
+    inside = textwrap.indent(",\n".join(lines), "  ")
     return f"{kind}(\n{inside},\n)"
 
 

@@ -1,4 +1,12 @@
-"""The command line. Nothing heavy is imported before the arguments are known to be good."""
+"""The command line `hybridjax`: options, and the sentences for those that are wrong.
+
+`main` reads the options and calls the function of a command (`_reproduce`, `_identify`, `_sweep`).
+Nothing heavy is imported before the arguments are known to be good, so imports stand inside of
+these functions, and must stay there. An option is added in the `_add_...` of its command, with a
+converter made by `_option`, which also has the words of its error. If a good option is refused,
+look at its converter. Options that contradict each other are refused in `_identify` and
+`_require_signals`.
+"""
 
 import argparse
 import math

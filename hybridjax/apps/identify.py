@@ -1,6 +1,13 @@
 """The command `hybridjax identify`: what it prints, and the files and the report that it writes.
 
-(The text about a result is that of `recordings.identification.Identification`.)
+`run` reads the recording, identifies it (`steps_of` turns options into a call of
+`identify_recording`) and writes the results (`write_results`): tables, `summary.json`
+(`summarize`), figures, and a page of HTML (`_page`, `_natural_page`). `Identification.write_report`
+calls `write_report`. Numbers and the text about a result are those of
+`recordings.identification.Identification`: if one is wrong, look there.
+
+A further figure is a line in `_figures` (or `_natural_figures`), its caption in `_CAPTIONS` and its
+name in `report_folder`, which replaces the files of an earlier report.
 """
 
 import base64

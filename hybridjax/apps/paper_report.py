@@ -1,4 +1,9 @@
-"""The report of `reproduce`: numbers, the paper's observations, a table."""
+"""The report of `reproduce`: numbers (`summarize`), the paper's observations, a table (`table`).
+
+Nothing is estimated here; each observation compares numbers of the results of `reproduce.py` with a
+statement of the paper. If a number is wrong, look at the fit it is read from; if an observation is,
+at its `_about_...`.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Mapping

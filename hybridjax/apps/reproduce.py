@@ -1,6 +1,9 @@
 """The paper from end to end: from the hopper to its Floquet multipliers, beside the exact answer.
 
 Ankarali & Cowan, Sec. VI. `hybridjax reproduce --out DIR` runs this.
+
+`_reproduce` takes the stages in order. The numbers of `Protocol` are the paper's. If a result
+differs from the paper, call the functions of its stage one by one; figures are those of `plot`.
 """
 
 import dataclasses

@@ -1,5 +1,12 @@
-"""A study: recordings of several subjects, listed in a table, with one report for each and one for
-all."""
+"""`identify_subjects`: recordings of several subjects, listed in a table, with one report for each
+and one for all.
+
+Each report is a job (`_report`, by `apps/identify.py`), done here or by a client (`_failures`); its
+failure becomes a sentence and does not stop the others. The fits are then read from the reports
+(`_population`), compared (`_effects`) and written (`_write`). If a report is not made anew although
+something has changed, or made anew without need, look at `job` in `_report`; if a row of the table
+is refused, at `_rows`. Wrong means have their cause in `recordings/population/`.
+"""
 
 import concurrent.futures
 import contextlib

@@ -10,6 +10,9 @@
 Lifting is in Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2. The harmonic state space is
 truncated, with an error that is measured against `LimitCycle.htf` (`_error_of`); the others are
 exact.
+
+If a harmonic state space is inaccurate, look at its `error`, then at `_linearized` (nodes) and
+`_toeplitz`; if signals of a lifted system are exchanged, at `_at_sections`.
 """
 
 import itertools

@@ -3,6 +3,9 @@
 Each type of result has a function that is registered with `_columns` and returns the columns by
 their names, or a finished table. Results with named axes go through `to_xarray`. A new type of
 result is one more function here; a result without one shows its findings.
+
+If a table has wrong numbers, look at the fields of the result first; if a column is missing, at the
+function of its type.
 """
 
 import functools

@@ -4,6 +4,9 @@
 gets a `Criterion` (`criterion.py`). Each goal has a function here that computes the derivatives of
 measurements by the unknowns (`Channel`), and those of the wanted quantities. A further kind of goal
 is added in `criterion_of`.
+
+If the criterion of a goal is wrong, compare `_channels` with differences of the HTFs, then the
+derivatives of the wanted quantities.
 """
 
 import dataclasses

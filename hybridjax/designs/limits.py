@@ -7,6 +7,10 @@ scaled to the true distortion of their experiments.
 
 `Limits` is what users give. `optimize.py` calls `power_limits` for the matrix W, `products` for G
 and Q, and `below_peaks` for the phases.
+
+If a design exceeds a limit, look at `power_limits` (rms values), `below_peaks` (peaks), or at
+`Products.rms` (distortion); if it stays far below the limit of distortion, at the bound
+(`_convex`).
 """
 
 import dataclasses

@@ -3,6 +3,9 @@ r"""Criteria of `fit_ldtp`, whose unknowns are the matrices of a linear periodic
 `criteria.py` calls `ldtp_matrices` and `response_criterion`. Unknowns are the local coordinates of
 `fit_ldtp`, in those combinations for which the information of the usual design is the identity.
 Combinations that the usual design does not determine are left out.
+
+If bounds are too small, look at the combinations that were left out (`_MISSED`); if they are wrong,
+compare `_rows` with differences of the HTFs.
 """
 
 import itertools

@@ -1,7 +1,14 @@
-"""Single trajectories with their events, dense enough to plot.
+"""Single trajectories with their events, dense enough to plot: `simulate` and `Trajectory`.
 
-`integrate` calls the search piece by piece, and makes the checks that programs leave out: guards on
-which a reset ends (`_passed`), and pulses (`unresolved.py`). Between steps, states follow cubics.
+`simulate` checks the arguments (`_start_of`) and calls `integrate`. This calls the search piece by
+piece (`_piece`), reads the moves from the tapes (`recorded`), and makes the checks that programs
+leave out: starts beyond a guard (`begins_beyond`), guards on which a reset ends (`_passed`), and
+pulses (`unresolved.py`). Between the ends of steps, states follow cubics (`Trajectory.at`).
+
+If steps or events are wrong, look at the search (`search/`); if states between steps are, at
+`Trajectory.at`. If a trajectory ends without need, its `result` says where to look: `GUARD_PASSED`
+comes from `_passed`, `PULSE_PASSED` from `unresolved.py`, all others from the search. If a good
+start has a finding, look at `guards_reached`.
 """
 
 import dataclasses

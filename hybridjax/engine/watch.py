@@ -6,6 +6,9 @@ crossings get their times and derivatives. Whether a function has crossed zero w
 decided in `search/accept.py`, and in `itinerary/flags.py` for trajectories that follow an
 itinerary. All watched functions are signed so that they fall at their event: with a wrong sign,
 events are missed or happen at once.
+
+If a crossing has a wrong time, look at `ChartFlow.locate`; if functions of another chart are
+evaluated, at `chart_flow` and `ChartFlow.rows`.
 """
 
 from typing import NamedTuple

@@ -2,8 +2,13 @@
 laboratory.
 
 `run_experiments`, `simulate_experiments` and plants return it, users can make it from arrays, and
-all estimates take it. Signals are sampled at the sections of a limit cycle. An experiment that
-failed has a `result` code and NaN; estimates leave it out.
+all estimates take it. Its conventions are a contract with all of these: signals are sampled at the
+sections, outputs are deviations from the cycle and sampled before the input acts, and estimates use
+the last P periods. An experiment that failed has a `result` code and NaN; estimates leave it out.
+
+The constructor only checks. If numbers are wrong, look at what made the data (`run.py` for
+simulations); if an estimate uses the wrong samples, at `windows`; if pairs with opposite inputs are
+refused, at `_OPPOSITE` and `odd_part`.
 """
 
 import dataclasses

@@ -3,7 +3,8 @@
 
 `run_experiments` takes a `ProcessNoise`, and calls its `draw`. The noise of an experiment depends
 on the seed and on the index of the experiment only, so that any part of a set can be computed
-alone.
+alone: this must stay so. If noise has a wrong variance or correlation, look at `draw` and
+`with_memory`; if linear responses are wrong, at `linear/time_response.py`.
 """
 
 import dataclasses

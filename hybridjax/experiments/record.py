@@ -3,6 +3,9 @@ with gaps.
 
 Data of experiments and of recordings are made of such records (`HasRecords`). Fits to time series
 call `uninterrupted_records` to get records without unknown inputs. Gaps are NaN.
+
+If a fit uses fewer samples than expected, look at `_with_known_inputs`, which cuts records and
+leaves out outputs near a gap; if data are refused because outputs repeat, at `require_deviations`.
 """
 
 import dataclasses

@@ -4,19 +4,26 @@ program.
 `flow_batch` moves all experiments from section to section, each time by a search for events
 (`engine/move.py`), with the first steps of a plan (`plan.py`). Each experiment is a *lane*, an
 entry on the last axis of arrays. `run.py` calls it for experiments that leave the tables of
-`passage.py`. `response_function` is the same for users, with derivatives. `Course` has the data of
-the sections. An experiment that fails without need has its cause in `examined`, or in the search.
+`passage.py`. `response_function` is the same for users, with derivatives.
+
+Times and events are counted within one turn: only so is every turn computed alike, and `scan`
+compiles one move for all sections. Tests and error estimates have no derivatives (`fixed`,
+`stop_gradient`).
+
+If outputs belong to the wrong side of an input, look at the order in `_Moves.to_next_section`. If
+an experiment fails without need, look at `_Moves.tested` (events in another order) or at the
+search. If `error` is wrong, look at `_largest_error`, and at `weight` in `plan.py`.
 """
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core.boundary.checked import checked, checked_methods
 from .._core.boundary.kinds import Numbers
@@ -28,8 +35,9 @@ from .._core.precision import require_x64
 from .._core.results import Result, update_result
 from .._core.text import folded, listed
 from ..engine.lanes import Lanes, fixed
-from ..engine.move import move
+from ..engine.move import Moved, move
 from ..engine.settings import EXPERIMENT, Settings
+from ..engine.target import Target
 from ..errors import DefinitionError
 from ..linear.algebra import Matrices
 from ..orbits.checks import check_outputs
@@ -92,10 +100,11 @@ class Feedback(NamedTuple):
 
 
 class Course(eqx.Module):
-    """The sections on a limit cycle, as experiments need them.
+    """The sections on a limit cycle: the parts of `PlacedSections` and of the cycle that the
+    compiled programs use, under the same names.
 
-    **Fields:** `outputs`, the outputs that are recorded at the sections. The other fields are as in
-    `PlacedSections` and `LimitCycle`.
+    **Fields:** `outputs`, the outputs that are recorded at the sections. `lanes`, the states of the
+    cycle at the sections.
     """
 
     system: HybridSystem
@@ -107,21 +116,21 @@ class Course(eqx.Module):
     has_event_sections: bool = eqx.field(static=True)
     """Whether a section is an event."""
 
-
-def course(placed: PlacedSections, outputs: Sequence[str | Output]) -> Course:
-    """Return the course of experiments around a limit cycle."""
-    cycle = placed.cycle
-    event = placed.bound.event
-    has_event_sections = is_traced(event) or bool((np.asarray(event) >= 0).any())
-    return Course(
-        cycle.system,
-        tuple(outputs),
-        placed.bound,
-        placed.lanes,
-        cycle.period,
-        cycle.event_sequence,
-        has_event_sections,
-    )
+    @classmethod
+    def of(cls, placed: PlacedSections, outputs: Sequence[str | Output]) -> "Course":
+        """Return the course of experiments around a limit cycle."""
+        cycle = placed.cycle
+        event = placed.bound.event
+        has_events = is_traced(event) or bool((np.asarray(event) >= 0).any())
+        return cls(
+            cycle.system,
+            tuple(outputs),
+            placed.bound,
+            placed.lanes,
+            cycle.period,
+            cycle.event_sequence,
+            has_events,
+        )
 
 
 def require_shape(shape: tuple[int, ...], n_sections: int, nu: int) -> None:
@@ -146,83 +155,158 @@ def flow_batch(
     `start` holds times and (padded) states at section 0. Differentiable in both modes; reverse mode
     stores the states at the sections and recomputes the flow between them.
     """
-    s = Structure(course.system)
-    period = course.period
-    sequence = course.event_sequence
-    z = s.resolve_outputs(course.outputs)
     N = len(course.bound.time)
-    S, n, _ = u.shape
-    one_turn = len(sequence)
+    _, n, _ = u.shape
+    moves = _Moves(course, plan, settings, feedback)
+    samples = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
+    batch = moves.begin(start)
+    batch, kept = jax.lax.scan(jax.checkpoint(moves.to_next_section), batch, samples)
+    end = jnp.concatenate([batch.lanes.t[None], batch.lanes.q])
+    end = jnp.where(batch.result == Result.OK, end, jnp.nan)
+    answer = kept.answer
+    return Response(
+        y=jnp.moveaxis(kept.y, -1, 0),
+        result=batch.result,
+        failed_at=jnp.where(kept.ok.all(axis=0), -1, jnp.argmin(kept.ok, axis=0)),
+        error=_largest_error(plan, kept.error.reshape(n // N, N, -1)),
+        end=end.T,
+        feedback=None if answer is None else jnp.moveaxis(answer, -1, 0),
+    )
 
-    def many(x):
-        return jnp.broadcast_to(x[..., :1], (*x.shape[:-1], S))
 
-    lanes = jax.tree_util.tree_map(many, course.lanes)
-    lanes = eqx.tree_at(lambda x: (x.t, x.q), lanes, (start[0], start[1:]))
+class _Batch(NamedTuple):
+    """S experiments at a section."""
 
-    def examined(result, lanes, u, section):
-        """The results of lanes on a section. (An event that is due at once on a section would be
-        missed: it is an error.)"""
-        if not course.has_event_sections:
-            return result
-        at_event = (result == Result.OK) & (course.bound.event[section] >= 0)
-        still_s, still_lanes, still_u = fixed((s, lanes, u))
-        missed = followed_at_once(still_s, still_lanes, still_u, at_event, period)
-        return update_result(result, missed >= 0, Result.EVENT_ORDER)
+    lanes: Lanes
+    result: Int[Array, " S"]
+    controller: Float[Array, "m S"]
+    """States of the controller."""
 
-    @jax.checkpoint
-    def section(carry, xs):
-        lanes, result, state = carry
-        k, u = xs
-        i = k % N
-        j = (k + 1) % N
+
+class _Sample(NamedTuple):
+    """The numbers that are kept of S experiments at a section, and of their move to the next."""
+
+    y: Float[Array, "ny S"]
+    ok: Bool[Array, " S"]
+    error: Float[Array, " S"]
+    """The largest error that the move causes at a later section (see `Plan.weight`)."""
+    answer: Float[Array, "nu S"] | None
+    """Values that the controller added to the inputs."""
+
+
+class _Moves:
+    """Moves of S experiments from a section to the next."""
+
+    def __init__(
+        self,
+        course: Course,
+        plan: Plan,
+        settings: Settings,
+        feedback: Feedback | None,
+    ):
+        self.course = course
+        self.plan = plan
+        self.settings = settings
+        self.feedback = feedback
+        self.s = Structure(course.system)
+        self.z = self.s.resolve_outputs(course.outputs)
+        self.N = len(course.bound.time)
+
+    def begin(self, start: Float[Array, "m S"]) -> _Batch:
+        """The experiments on section 0."""
+        S = start.shape[1]
+
+        def of_section_zero(x):
+            return jnp.broadcast_to(x[..., :1], (*x.shape[:-1], S))
+
+        lanes = jax.tree_util.tree_map(of_section_zero, self.course.lanes)
+        lanes = lanes._replace(t=start[0], q=start[1:])
+        no_input = jnp.zeros((self.s.nu, 1))
+        ok = jnp.zeros(S, jnp.int32)
+        result = self.without_missed_event(ok, lanes, no_input, 0)
+        feedback = self.feedback
+        states = 0 if feedback is None else feedback.matrices.A.shape[1]
+        return _Batch(lanes, result, jnp.zeros((states, S)))
+
+    def to_next_section(self, batch: _Batch, sample) -> tuple[_Batch, _Sample]:
+        """Move the experiments to the next section, under an input that is held until then.
+
+        The order matters: the controller measures before it acts, outputs are recorded before the
+        move, and the values that the controller adds act from the recording on.
+        """
+        k, u = sample
+        i = k % self.N
+        j = (k + 1) % self.N
+        lanes, result, controller = batch
         answer = None
-        if feedback is not None:
-            # (The controller measures outputs before the input acts.)
-            answer, state = feedback.answer(i, state, observe(s, z, lanes, u))
+        if self.feedback is not None:
+            measured = observe(self.s, self.z, lanes, u)
+            answer, controller = self.feedback.answer(i, controller, measured)
             u = u + answer
-        y = jnp.where(result == Result.OK, observe(s, z, lanes, u), jnp.nan)
+        y = observe(self.s, self.z, lanes, u)
+        y = jnp.where(result == Result.OK, y, jnp.nan)
+
         turns = (j == 0).astype(jnp.int32)
-        to = j[None], lanes.t, turns[None]
-        target = section_target(course.bound, course.lanes, period, *to)
-        target = dataclasses.replace(target, event_sequence=sequence)
-        stride = plan.stride(i, S)
-        moved = move(s, lanes, u, target, settings, stride, result).moved
-        # An event may happen before or after a section, but the number of events in a period must
-        # be that of the cycle.
-        expected = course.lanes.events[j] + turns * one_turn
-        wrong = jnp.abs(moved.lanes.events - expected) > 1
-        result = update_result(moved.result, wrong, Result.EVENT_ORDER)
-        result = examined(result, moved.lanes, u, j)
-        # Times and events are counted within one turn, so that every turn is computed alike.
-        t = moved.lanes.t - turns * period
-        events = moved.lanes.events - turns * one_turn
-        lanes = moved.lanes._replace(t=t, events=events)
+        stride = self.plan.stride(i, result.shape[0])
+        target = self.target(j, lanes.t, turns)
+        moved = move(self.s, lanes, u, target, self.settings, stride, result).moved
+        result = self.tested(moved, u, j, turns)
+        lanes = self.within_one_turn(moved.lanes, turns)
+
         ok = result == Result.OK
         counts = ok & (moved.error > 0)
-        share = jnp.where(counts, moved.error * plan.weight[i], 0.0)
-        return (lanes, result, state), (y, ok, jax.lax.stop_gradient(share), answer)
+        error = jnp.where(counts, moved.error * self.plan.weight[i], 0.0)
+        kept = _Sample(y, ok, jax.lax.stop_gradient(error), answer)
+        return _Batch(lanes, result, controller), kept
 
-    xs = (jnp.arange(n), jnp.transpose(u, (1, 2, 0)))
-    states = 0 if feedback is None else feedback.matrices.A.shape[1]
-    still = jnp.zeros((s.nu, 1))
-    result = examined(jnp.zeros(S, jnp.int32), lanes, still, 0)
-    begin: Any = (lanes, result, jnp.zeros((states, S)))
-    (lanes, result, _), (y, ok, shares, answers) = jax.lax.scan(section, begin, xs)
-    failed_at = jnp.where(ok.all(axis=0), -1, jnp.argmin(ok, axis=0))
-    each_turn = jnp.sum(shares.reshape(n // N, N, S), axis=1)
-    error = ROUNDING + plan.least + jnp.max(each_turn, axis=0)
-    end = jnp.concatenate([lanes.t[None], lanes.q])
-    end = jnp.where(result == Result.OK, end, jnp.nan)
-    answers = None if answers is None else jnp.moveaxis(answers, -1, 0)
-    return Response(
-        y=jnp.moveaxis(y, -1, 0),
-        result=result,
-        failed_at=failed_at,
-        error=error,
-        end=end.T,
-        feedback=answers,
-    )
+    def target(self, j: Array, t: Float[Array, " S"], turns: Array) -> Target:
+        """Section j, after `turns` further periods of the cycle (1 at its end, else 0)."""
+        course = self.course
+        target = section_target(
+            course.bound, course.lanes, course.period, j[None], t, turns[None]
+        )
+        return dataclasses.replace(target, event_sequence=course.event_sequence)
+
+    def tested(self, moved: Moved, u: Array, j: Array, turns: Array) -> Array:
+        """The results of experiments that were moved to section j, with `EVENT_ORDER` for those
+        that met other events than the cycle."""
+        on_cycle = self.course.lanes.events[j]
+        one_turn = len(self.course.event_sequence)
+        # (An event may happen before a section, and on the cycle after it: a difference of 1 is
+        # allowed. Events count from the start, so that differences do not add up.)
+        difference = moved.lanes.events - (on_cycle + turns * one_turn)
+        wrong = jnp.abs(difference) > 1
+        result = update_result(moved.result, wrong, Result.EVENT_ORDER)
+        return self.without_missed_event(result, moved.lanes, u, j)
+
+    def without_missed_event(
+        self, result: Array, lanes: Lanes, u: Array, j: Array | int
+    ) -> Array:
+        """The results, with `EVENT_ORDER` for experiments in which a second event is due at once
+        after the event that is section j: the next move would begin behind it and miss it."""
+        course = self.course
+        if not course.has_event_sections:
+            return result
+        at_event = (result == Result.OK) & (course.bound.event[j] >= 0)
+        s, lanes, u = fixed((self.s, lanes, u))
+        missed = followed_at_once(s, lanes, u, at_event, course.period)
+        return update_result(result, missed >= 0, Result.EVENT_ORDER)
+
+    def within_one_turn(self, lanes: Lanes, turns: Array) -> Lanes:
+        """Experiments with times and events counted within one turn."""
+        one_turn = len(self.course.event_sequence)
+        t = lanes.t - turns * self.course.period
+        return lanes._replace(t=t, events=lanes.events - turns * one_turn)
+
+
+def _largest_error(plan: Plan, errors: Float[Array, "p N S"]) -> Float[Array, " S"]:
+    """Estimate of the largest error of each experiment, from those of its moves.
+
+    `Plan.weight` contains the effect on all later periods if each period makes the same error. The
+    errors are therefore added within a period only, and the worst period counts.
+    """
+    of_period = jnp.sum(errors, axis=1)
+    return ROUNDING + plan.least + jnp.max(of_period, axis=0)
 
 
 @checked_methods
@@ -282,7 +366,7 @@ class ResponseFunction(eqx.Module):
         if start is None:
             start = jnp.tile(placed.section_zero[:, None], len(u))
         return flow_batch(
-            course(placed, self.outputs),
+            Course.of(placed, self.outputs),
             self.stepping.plan,
             start,
             u,

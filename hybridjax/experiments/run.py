@@ -52,7 +52,6 @@ from .response import (
     Course,
     Feedback,
     Response,
-    course,
     flow_batch,
     require_shape,
 )
@@ -203,7 +202,7 @@ class Campaign:
             on_cycle = np.asarray(self.placed.observe(tuple(z.items)))
             return _AtSections(
                 outputs=z,
-                course=course(self.placed, z.items),
+                course=Course.of(self.placed, z.items),
                 on_cycle=on_cycle,
                 given=self.outputs,
             )

@@ -4,6 +4,10 @@ processes fills.
 The experiments themselves are computed by a `Campaign` (`run.py`). This file decides only which of
 them run together, and where the records go. `ExperimentJob` is what the general code for stores
 (`_core/pieces/`) asks for: the description of the experiments, and the records of each chunk.
+
+A further option that changes records must be in `ExperimentJob.description`: otherwise a store with
+other records is continued. If a store is refused without need, look there, and at `arrays`; if
+records are wrong, at `run.py`.
 """
 
 import dataclasses

@@ -6,6 +6,9 @@ guesses (`_starts_around`), an iteration from each guess (`_descend`), and the b
 `ModelFit` (`_of_end`). Data convert limit cycles to residuals (`observations.py`); residuals are
 evaluated in `beside.py` or `problem.py`. `identifiability` evaluates the Jacobian once, without a
 fit.
+
+If a fit ends at a wrong minimum, look at `_starts_around` and `_descend`; if residuals are wrong,
+at `observations.py` or `transients.py`; if standard errors are, at `_of_end`.
 """
 
 from collections.abc import Sequence

@@ -4,6 +4,10 @@ of parameters that data identify.
 `fit.py` makes both. `diagnose` finds combinations without effect from the singular values of the
 sensitivities, and `_readable` and `_rounded` bring them to a form with small integers.
 `ParameterFit` has what does not need the system: standard errors, confidence regions, comparisons.
+
+If a combination is identified by rounding alone, or one that the data determine is not, look at
+`_RANK`; if a combination is printed badly, at `_CLOSE` and `_describe`. Wrong standard errors come
+from the covariance, which `fit.py` computes.
 """
 
 import itertools

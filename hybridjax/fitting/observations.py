@@ -26,7 +26,7 @@ from ..errors import DefinitionError
 from ..experiments.data import ExperimentData
 from ..experiments.plan import Plan
 from ..experiments.record import require_deviations
-from ..experiments.response import course, flow_batch, response_function
+from ..experiments.response import Course, flow_batch, response_function
 from ..identify.weights import check_values, error_weights, largest_misfit
 from ..linear.htf import HTF
 from ..orbits.cycle import LimitCycle
@@ -229,7 +229,8 @@ class ObservedSeries(AbstractObservation):
         start = jnp.tile(placed.section_zero[:, None], len(self.u))
         assert self.flow is not None, "`prepare` was not called"
         plan, settings = self.flow
-        y = flow_batch(course(placed, self.outputs), plan, start, self.u, settings).y
+        course = Course.of(placed, self.outputs)
+        y = flow_batch(course, plan, start, self.u, settings).y
         if not self.absolute:
             y = y - jnp.tile(
                 placed.observe(self.outputs), (y.shape[1] // placed.n_sections, 1)

@@ -2,7 +2,9 @@
 optimization.
 
 The largest modulus itself has no derivative where multipliers coincide. `_smooth_radius` solves for
-the bound by Newton's method.
+the bound by Newton's method. The equation in the docstring of `spectral_radius` is the contract; if
+the bound is wrong, compare it with `excess`. No error is raised: matrices that are not finite give
+NaN, and so may a `smoothing` below 1e-14, which rounding hides.
 """
 
 import jax
@@ -58,32 +60,35 @@ def spectral_radius(
     """
     if isinstance(model, LimitCycle):
         model.require_found()
-    power = monodromy(model.A if isinstance(model, LDTP) else model.factors)
-    return _smooth_radius(power, jnp.asarray(smoothing, float))
+    matrix = monodromy(model.A if isinstance(model, LDTP) else model.factors)
+    return _smooth_radius(matrix, jnp.asarray(smoothing, float))
 
 
 @jax.jit
 def _smooth_radius(
-    power: Float[Array, "d d"], smoothing: Float[Array, ""]
+    matrix: Float[Array, "d d"], smoothing: Float[Array, ""]
 ) -> Float[Array, ""]:
-    d = power.shape[0]
+    d = matrix.shape[0]
 
-    def excess(x, power):
-        """Logarithm of the sum over that of d / epsilon, at rho = e^x: convex and falling."""
+    def excess(x, matrix):
+        """Logarithm of the left side of the equation, at rho = e^x, minus that of the right side:
+        convex and falling."""
         identity = jnp.eye(d)
-        twice = jnp.kron(power, power)  # its powers map vec(I) to vec(P P^T)
+        twice = jnp.kron(matrix, matrix)  # its powers map vec(I) to vec(P P^T)
         total = jnp.linalg.solve(
             jnp.eye(d * d) - jnp.exp(-2 * x) * twice, identity.ravel()
         )
         return jnp.log(identity.ravel() @ total) - jnp.log(d / smoothing)
 
-    fixed = jax.lax.stop_gradient(power)
-    true = jnp.max(jnp.abs(jnp.linalg.eigvals(fixed)))
-    begin = jnp.log(
-        jnp.maximum(true / jnp.sqrt(1 - smoothing / d), 1e-6 * jnp.linalg.norm(fixed))
+    # From a lower bound, Newton's method increases and never passes the root. (The norm is for
+    # nilpotent matrices, whose multipliers are zero.)
+    fixed = jax.lax.stop_gradient(matrix)
+    largest = jnp.max(jnp.abs(jnp.linalg.eigvals(fixed)))
+    lower_bound = jnp.maximum(
+        largest / jnp.sqrt(1 - smoothing / d), 1e-6 * jnp.linalg.norm(fixed)
     )
-    # (From the lower bound, Newton's method increases and never passes the root.)
     solver: optx.Newton = optx.Newton(rtol=1e-12, atol=1e-12)
+    begin = jnp.log(lower_bound)
     return jnp.exp(
-        optx.root_find(excess, solver, begin, power, max_steps=64, throw=False).value
+        optx.root_find(excess, solver, begin, matrix, max_steps=64, throw=False).value
     )

@@ -4,6 +4,10 @@ transients.
 `fit_model` calls `residuals_of` for each trajectory: the flow from its start (`orbits/flow.py`),
 with outputs at the measured times and times of events, minus the measurements. States at the start
 may be unknown (`start_value`, `with_start`).
+
+Residuals are NaN where the flow lacks a measurement: `lack_of` says why. If a residual is wrong,
+look at `residuals_of` (which event is compared with which) and `_outputs`; if it has a wrong
+weight, at `_sizes` and `_event_size`.
 """
 
 from collections.abc import Callable, Mapping
@@ -67,7 +71,7 @@ class ObservedTrajectory(AbstractObservation):
     outputs: tuple[str, ...] = eqx.field(static=True)
     values: Float[Array, "K ny"]
     known: tuple[int, ...] = eqx.field(static=True, repr=False)
-    """Indices of the values that are not NaN."""
+    """Indices, in `values.ravel()`, of the values that are not NaN."""
     scale: Float[Array, " ny"]
     events: tuple[str, ...] = eqx.field(static=True)
     event_times: tuple[Float[Array, " E"], ...]
@@ -214,6 +218,7 @@ def _request(observation: ObservedTrajectory, system: HybridSystem) -> Any:
 def _outputs(
     observation: ObservedTrajectory, found: Flow, samples: Samples
 ) -> Float[Array, "K ny"]:
+    """The outputs of the flow at the measured times."""
     s = found.structure
     K = len(observation.times)
     chart = samples.chart[:, 0]
@@ -301,8 +306,8 @@ def _samples(
     **Raises:** `DefinitionError` if one of the three lacks, for a shape that does not fit, and if
     all samples are missing.
     """
-    given = {times is not None, bool(outputs), values is not None}
-    if len(given) > 1:
+    given = [times is not None, bool(outputs), values is not None]
+    if any(given) and not all(given):
         raise DefinitionError(
             "ObservedTrajectory: give `times`, `outputs` and `values` together."
         )
@@ -354,6 +359,8 @@ def _sizes(
 
 
 def _event_size(std: Any, lists: list[np.ndarray], start: Guess) -> Float[Array, ""]:
+    """Standard deviation of times of events; if none is given, the mean of the intervals between
+    events of one name, averaged over the names."""
     if std is not None:
         return jnp.asarray(std, float)
     if not lists:

@@ -3,6 +3,9 @@
 It has the fields and methods that every fit shares: multipliers, covariance, intervals, findings,
 and how a fit is printed. Subclasses say what their numbers are (`_estimates`), how they are
 summarized (`_summary`, `_page`), and which model can be simulated (`_linear_model`).
+
+The order of what is printed, and the form of intervals, are those of all fits: a change here
+changes every fit. If a number is wrong, look at the subclass.
 """
 
 from abc import abstractmethod

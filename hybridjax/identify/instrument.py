@@ -16,6 +16,9 @@ With the estimated P, the expectation of $E E^*$ is the variance times $M - 2 n 
 
 `estimate_htf` and `estimate_loop` call this file: `spectral_products` sums the products of spectra
 over experiments, and `solve` computes P and its variances (`_solve_classes`).
+
+If the plant is wrong, compare `_solve_classes` with these formulas; if data are refused, look at
+`_require_answers` and `require_loop`; if lines are missing, at `excited_classes`.
 """
 
 import dataclasses

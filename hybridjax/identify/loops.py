@@ -4,6 +4,9 @@ loop.
 Each of these is an HTF from one set of signals to another, with an external reference as the
 instrument; it is estimated by `instrument.solve` from the same sums. `Loop.missing` says which of
 them the data do not give.
+
+If the plant is wrong and the closed loop is right, look at `instrument.py`; if HTFs are missing, at
+`_require_references`.
 """
 
 from collections.abc import Sequence

@@ -13,6 +13,9 @@ Given F and C, predictions are linear in $B - K D$, K and D, which are the other
 
 `fit_ldtp`, bounds and designs call `local_coordinates(model)`, and `moved(step)` for the next
 model.
+
+If a fit drifts without changing its predictions, look at `local_coordinates`; if a new model is not
+the expected one, at `LocalCoordinates.moved`.
 """
 
 from collections.abc import Callable

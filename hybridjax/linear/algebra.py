@@ -5,6 +5,10 @@ $w = K z + L r$ and $y = M z$ connect them.
 
 HTFs are matrices, one for each class of frequencies f + integers: components of the input at
 f + b become components of the output at f + a by $H(f)[a, b] = H_{a-b}(f + b)$, indices modulo N.
+
+`LDTP` and `HTF` call these functions. If a connection of systems is wrong, look at `connect`; if
+that of HTFs is, at `Lines` (which line stands where), then at the operation; if only variances are,
+at the pairs (G, H) that the operation returns.
 """
 
 from collections.abc import Callable
@@ -176,9 +180,12 @@ class Lines(NamedTuple):
         K, N = self.row.shape
         ny = matrices.shape[1] // N
         values = matrices.reshape(K, N, ny, N, -1).swapaxes(2, 3)
+        # Class k and column b in which each line stands first.
         _, first = np.unique(self.row, return_index=True)
         k, b = np.unravel_index(first, self.row.shape)
         mirrored = self.mirrored[k, b]
+        # H_m stands m rows below the diagonal; of a line that stands for its mirror image -f, it is
+        # the conjugate of H_-m.
         m = np.arange(N)[:, None] - N // 2
         a = (b + np.where(mirrored, -m, m)) % N
         values = values[k, a, b]

@@ -1,4 +1,13 @@
-"""The exact harmonic transfer functions of an LDTP system, for the host and for XLA."""
+"""The exact harmonic transfer functions (HTFs) of an LDTP system, for the host and for XLA.
+
+`LDTP.htf` calls `harmonic_transfer`, whose docstring has the formulas. The periodic states come
+from `_states`: a sum over one period, and a linear system for the state at its beginning. Where
+derivatives must come from the host, `_along` computes them by the same functions.
+`check_harmonics` says which harmonics exist, also for other files.
+
+If H is wrong at all harmonics, look at `_states`; if only its derivatives are, at `_along`. If H_m
+and H_-m are exchanged, the order is that of the FFT: harmonic m is at index m mod N.
+"""
 
 import functools as ft
 from collections.abc import Callable, Iterable
@@ -85,25 +94,26 @@ def _along(*arrays: jax.Array) -> Complex[np.ndarray, "... N F ny nu"]:
     lead = np.shape(arrays[0])[:-3]
     first = (0,) * len(lead)
     A, B, C, _, f = (np.asarray(x)[first] for x in arrays[:5])
+    # Axes: directions, N, 1 (for frequencies), rows, columns.
     tangents = [np.asarray(x) for x in arrays[5:]]
-    # (directions, N, 1, rows, columns): frequencies have the axis after that of sections.
-    along_sections = [x.reshape(-1, *x.shape[-3:]) for x in tangents]
-    dA, dB, dC, dD = (x[:, :, None] for x in along_sections)
-    P, N, _, d, _ = dA.shape
-    nu = B.shape[-1]
-    F = f.size
+    by_direction = [x.reshape(-1, *x.shape[-3:]) for x in tangents]
+    dA, dB, dC, dD = (x[:, :, None] for x in by_direction)
     z = _unit_roots(A, f)
     X = _states(A, z * B[:, None], f)
-    # Directions are further columns of the forcing.
-    forcing = dA @ X + z * dB
-    by_direction = np.moveaxis(forcing, 0, -2)
-    columns = by_direction.reshape(N, F, d, P * nu)
-    dX = _states(A, columns, f).reshape(N, F, d, P, nu)
-    dX = np.moveaxis(dX, -2, 0)
-    by_state = C[:, None] @ dX
-    dG = (dC @ X + by_state) / z + dD
-    dG = np.fft.fft(dG, axis=1) / N
-    return dG.reshape(*lead, N, F, len(C[0]), nu)
+    dX = _states_by_direction(A, dA @ X + z * dB, f)
+    dG = (dC @ X + C[:, None] @ dX) / z + dD
+    dH = np.fft.fft(dG, axis=1) / len(A)
+    return dH.reshape(*lead, *dH.shape[1:])
+
+
+def _states_by_direction(
+    A: np.ndarray, forcing: Complex[np.ndarray, "P N F d nu"], f: np.ndarray
+) -> Complex[np.ndarray, "P N F d nu"]:
+    """The responses of the states to P forcings, which are further columns of one forcing."""
+    P, N, F, d, nu = forcing.shape
+    columns = np.moveaxis(forcing, 0, -2).reshape(N, F, d, P * nu)
+    states = _states(A, columns, f).reshape(N, F, d, P, nu)
+    return np.moveaxis(states, -2, 0)
 
 
 def _unit_roots(A: Array, f: Array) -> Array:

@@ -1,4 +1,15 @@
-"""Harmonic transfer functions: exact or estimated, one container for both."""
+"""`HTF`: harmonic transfer functions on a grid of frequencies, exact or estimated.
+
+`LDTP.htf`, `LimitCycle.htf` and `estimate_htf` make it; fits, designs and figures take it. Its
+conventions are a contract with all of these: H_m stands at the *input* frequency, frequencies are
+in cycles per period, and `variance` is E|dH|^2 of the complex error. Series, sums, inverses and
+feedback connect HTFs as matrices (`algebra.py`), which needs all N harmonics. `VarianceDof` has the
+accuracy of an estimated variance.
+
+If the HTF of a loop is wrong, look at `algebra.py`; if its variance is, at `_variances` and
+`algebra.variance_of`. If discs are too small or too large, look at `VarianceDof.quantile`; if a
+prediction has a wrong frequency, at `HTF.predict`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,15 @@
-"""Linear discrete-time periodic systems whose state dimension may vary over the period."""
+"""`LDTP`: linear discrete-time periodic systems whose state dimension may vary over the period.
+
+`linearize`, fits and users make it. The class checks arguments; the numbers come from
+`frequency_response.py` (HTFs), `time_response.py` (responses, monodromy matrix), `multipliers.py`
+and `algebra.py` (connections of systems). Matrices are padded with zeros to the largest dimension.
+All algebra relies on these zeros: a method that returns an `LDTP` must keep them, and
+`_check_padding` refuses others.
+
+If multipliers are missing, look at `_RANK_TOLERANCE` and `multipliers.py`; if a response is refused
+as unbounded, at `_refuse_resonance`; if a connection has wrong signs, at the matrices K, L, M of
+`feedback`, `@` and `+`, which `algebra.connect` explains.
+"""
 
 from collections.abc import Sequence
 from typing import Annotated, Any

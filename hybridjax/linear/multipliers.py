@@ -3,6 +3,10 @@
 The factors `A[N-1] ... A[0]` may be rectangular: `A[n]` is `(d[n+1], d[n])`, cyclically. A product
 in double precision destroys eigenvalues smaller than `1e-16` of the largest; the factors do not.
 Tolerances are on factors only, never on eigenvalues.
+
+`product_rank` and `product_eigenvalues` are the entries. If a multiplier is missing, look at
+`_carry_range` and the tolerance that the caller gives; if one is wrong, at `_diagonal_blocks`; if a
+pair is not conjugate, at `_eigenvalues`.
 """
 
 import itertools

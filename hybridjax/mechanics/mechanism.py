@@ -8,6 +8,10 @@ where h holds the forces of Coriolis, of centrifugal acceleration and of gravity
 forces of the contacts whose coordinates c(q) have the derivative J = dc/dq (R. M. Murray, Z. Li, S.
 S. Sastry, A Mathematical Introduction to Robotic Manipulation, 1994, ch. 4 and 6). No Christoffel
 symbol is formed: h is one derivative along v of the momentum dT/dv, less one gradient.
+
+Fields of models call the methods of `Mechanism`, each for one state. Signs are a contract with
+them: forces and impulses act on the mechanism. If a motion is wrong, test `mass` and `bias` first,
+as all other methods use them: without forces, `energy` stays constant.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,10 @@
-"""Balls that bounce: on fixed ground, on a vibrating paddle, and in a row on a shaken table."""
+"""Balls that bounce: on fixed ground, on a vibrating paddle, and in a row on a shaken table.
+
+A single ball falls freely, so that its cycle on the paddle is known in closed form
+(`PaddleJuggler.exact`), which tests compare. On fixed ground, a restitution below 1 gives
+infinitely many impacts in finite time. If an impact is wrong, look at the reset in `transitions`,
+or in `ChainContact.impact`.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -1,4 +1,12 @@
-"""Actuated bipeds: the three-link walker with a torso, and the five-link robot RABBIT."""
+"""Actuated bipeds: the three-link walker with a torso (`TorsoWalker`), and the five-link robot
+RABBIT (`FiveLinkBiped`).
+
+Both are chains of links (`chain`), whose equations of motion and impacts come from
+`mechanics/mechanism.py`, under feedback that holds outputs (`accelerations_under_feedback`). Angles
+are absolute, from the vertical. After an impact, the legs exchange their names. The classes cite
+their sources, and tests rely on the default parameters. If a motion is wrong, look at `mechanism`
+(masses and lengths) first, then at the feedback; if a step is, at `_touchdown`.
+"""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,10 @@
-"""The vertical hopper of the paper, the same on compliant ground, and a coupled pair of them."""
+"""The vertical hopper of the paper, the same on compliant ground, and a coupled pair of them.
+
+`VerticalHopper` has the equations, which the other two reuse. A foot that rests on rigid ground has
+no states in its chart. Each class cites its source; examples, tests and benchmarks rely on the
+default parameters. If a motion is wrong, look at `leg` (the force between both masses) and
+`_moving`; if an event is, at its guard in `transitions`.
+"""
 
 import itertools
 import math

@@ -1,4 +1,9 @@
-"""Neurons that spike."""
+"""Neurons that spike: adaptive exponential, Izhikevich, and FitzHugh-Nagumo.
+
+The first two are `DrivenNeuron`s: a periodic current, times in ms, and a reset at the `peak`. The
+third has no reset and no units. Each class has its equations and its source in the docstring; tests
+rely on the default parameters. If spikes are wrong, look at `transitions` and `after_spike`.
+"""
 
 import abc
 

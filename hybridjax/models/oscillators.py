@@ -1,4 +1,10 @@
-"""Oscillators: clocked and autonomous, smooth and piecewise smooth."""
+"""Oscillators: clocked and autonomous, smooth and piecewise smooth.
+
+Each class is one system and cites its source; where its equation is short, it stands in the
+docstring. Examples and tests rely on the default parameters and guesses. A further oscillator is
+one more class, with its name in `models/__init__.pyi`. If one has no cycle, look at its guess
+first.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array

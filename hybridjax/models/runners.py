@@ -1,4 +1,11 @@
-"""Runners on springy legs: a bar on two legs, a quadruped that trots, and a point mass."""
+"""Runners on springy legs: a bar on two legs (`TwoLeggedBar`), a quadruped that trots
+(`TrottingQuadruped`), and a point mass (`SLIPRunner`).
+
+The charts of the bar are named by the legs that stand; `length`, `speed` and `force` of a leg are
+its whole mechanics. The quadruped is a bar with other parameters and a `reflex`; both of its feet
+land at the same time, so that events coincide. Examples and tests rely on the default parameters.
+If a touchdown is wrong, look at `_step` and `_impact`, or at `landed` of the point mass.
+"""
 
 import itertools
 import math
@@ -162,8 +169,8 @@ class TrottingQuadruped(TwoLeggedBar):
     order has a derivative of its own (`cycle.simultaneous_events()`), and `find_limit_cycle`
     raises an error that reports this.
 
-    The body on springy legs is that of `bar.py`. Events that coincide on its cycle make the flow
-    piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
+    The body on springy legs is that of `TwoLeggedBar`. Events that coincide on its cycle make the
+    flow piecewise differentiable: S. A. Burden, S. S. Sastry, D. E. Koditschek, S. Revzen,
     Event-selected vector field discontinuities yield piecewise-differentiable flows, SIAM J.
     Applied Dynamical Systems 15, 2016.
     """

@@ -1,4 +1,10 @@
-"""Passive walkers on a slope: the rimless wheel, the simplest walking model, the compass gait."""
+"""Passive walkers on a slope: the rimless wheel, the simplest walking model, the compass gait.
+
+Angles are from the vertical or from the normal of the slope, as the docstring of each class says,
+with the source. After an impact, the legs exchange their names (`after`, `_heelstrike`). Cycles and
+multipliers are published for the default parameters, or known in closed form (`exact`), and tests
+compare them. If a step is wrong, look at the guard and the reset in `transitions` first.
+"""
 
 import math
 

@@ -8,6 +8,10 @@ from .branches import (
 from .coincidence import (
     SimultaneousEvents as SimultaneousEvents,
 )
+from .coupling import (
+    Coupling as Coupling,
+    Locked as Locked,
+)
 from .cycle import LimitCycle as LimitCycle
 from .flow import Flow as Flow
 from .fluctuations import Fluctuations as Fluctuations
@@ -16,9 +20,7 @@ from .limit_cycles import (
     find_limit_cycles as find_limit_cycles,
 )
 from .responses import (
-    Coupling as Coupling,
     Impulse as Impulse,
-    Locked as Locked,
     PhaseCurve as PhaseCurve,
     Responses as Responses,
 )

@@ -10,6 +10,9 @@ If these derivatives are equal, as for events that do not influence each other, 
 
 `find.py`, `limit_cycles.py` and `flow.py` call `commutes` or `groups_on`. Coinciding events are
 found by `_coincidence`, and every order of them is computed by `_orders`.
+
+If events count as simultaneous and are not, look at `SAME` and `_coincidence`; if their effect is
+judged wrongly, compare the orders in `_orders`, and the test in `_commute`.
 """
 
 import itertools

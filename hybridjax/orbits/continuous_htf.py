@@ -8,6 +8,10 @@ linear periodically time varying systems, MIT 1991).
 
 `LimitCycle.htf` calls `continuous_htf`; `_transfer` does the work. A *piece* is a part of the cycle
 between events, with `NODES` nodes.
+
+If a response is wrong at all frequencies, look at `LinearFlow.driven`; if it is wrong at high ones
+alone, at `longest_piece`; if it is wrong between computed frequencies, at `_interpolation`; if
+outputs are wrong, at `linear_outputs`.
 """
 
 import functools as ft

@@ -50,12 +50,13 @@ from ..linear.htf import HTF
 from ..linear.multipliers import product_eigenvalues
 from ..systems.structure import Structure
 from ..systems.system import HybridSystem, OutputNames, arrays_of, name_of
+from .asymptotic_phase import asymptotic_phase
 from .coincidence import SimultaneousEvents, simultaneous_events
 from .continuous_htf import continuous_htf
 from .crossing import AtEvent, Crossing
 from .fluctuations import Fluctuations, Given, GivenResets, fluctuations
 from .linear_flow import hosted, last_turn, linear_flow, recorded_ends, rule
-from .responses import Responses, asymptotic_phase, responses
+from .responses import Responses, responses
 from .return_map import ReturnMap
 from .scale import ROUNDING, has_implicit, in_sizes, sizes_of, stiff_charts
 from .sensitivity import Sensitivity, sensitivity

@@ -29,8 +29,8 @@ from .._core.text import number
 from ..errors import ComputationError
 from ..systems.structure import Structure
 from ..systems.system import name_of
-from .linear_flow import LinearFlow, linear_flow, rule
-from .responses import Phases, loop, surface
+from .linear_flow import LinearFlow, Phases, linear_flow, rule
+from .responses import closing, effect_of_pushes
 from .return_map import SINGULAR
 from .sensitivity import section_delay
 
@@ -183,7 +183,7 @@ def _noisy(
     valid = xp.append(map.valid, xp.ones(n - d, bool))
     turn = xp.where(valid[:, None], turn, 0.0)
     field = flow.field[0, 0]
-    _, phase = loop(map, turn[:d, :d], field)
+    phase = closing(map, turn[:d, :d], field).phase
     diffusion = _diffusion(map, phase, noise[:d, :d])
 
     # (A state ahead of the cycle meets the next events earlier.)
@@ -451,7 +451,7 @@ def _columns(
     of_inputs = np.array([white.get(x, 0.0) for x in s.inputs])
     at_nodes = xp.asarray(of_states)[flow.chart]
     alone = at_nodes[:, None, :, None] * np.eye(s.d)
-    direct = surface(s, flow) @ alone
+    direct = effect_of_pushes(s, flow) @ alone
     return xp.concatenate([direct, flow.by_input * of_inputs], axis=-1)
 
 

@@ -3,6 +3,10 @@
 `return_map_near` takes the stages in order: it checks the guess, estimates the magnitudes of the
 states and simulates for `settle`. If no clock drives the system, it then flows to the section and
 back to it (`_on_section`). The time between gives the first guess of the period.
+
+If a search begins at a wrong place, look at these stages in turn; if the section is not found, at
+`_next_crossing`; if a wrong section is proposed, at `after_rarest_event` and `met_once`. The
+constants limit how long it looks: change them if guesses are given up too early.
 """
 
 import dataclasses

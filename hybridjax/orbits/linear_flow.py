@@ -12,7 +12,7 @@ is wrong everywhere, look at `_implicit`; if it is wrong after events, at `_jump
 import dataclasses
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,6 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 
 from .._core.boundary.checked import NeedsValues
+from .._core.boundary.kinds import Numbers
+from .._core.boundary.values import Reals
 from .._core.executor import Array, is_hidden, namespace, on_host, scan, solve, to_host
 from .._core.host_derivatives import by_columns
 from .._core.memo import Memory, remembered
@@ -48,6 +50,8 @@ from .scale import has_implicit
 # Number of nodes of a piece, including both ends. Fewer: polynomials through them lose digits of
 # responses. More: collocation equations grow.
 NODES = 12
+
+Phases = Annotated[Numbers, Reals("p")]
 
 
 class Rule(NamedTuple):

@@ -7,6 +7,9 @@ not converge begins again from a neighbor whose cycle is known, and follows the 
 no route suits, a search finds one more cycle, whose route is tried for the remaining systems.
 Systems that still have no cycle are left to `batches.py`. A *lane* is one system of a call, and a
 *leg* a part between two events.
+
+If a cycle is wrong, look at `repeat.py`; if many systems are left over, at `Solver.nearest` and the
+constants, which limit rounds and searches.
 """
 
 import collections

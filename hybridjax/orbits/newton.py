@@ -7,6 +7,9 @@ tested, in *sizes* of the states (their magnitudes, `scale.py`). `search` lists 
 further kind of attempt, such as a restart from a random state, is added there. On the host,
 `_root_on_host` has the iteration; inside of programs of JAX, `_root`. Derivatives of the result are
 implicit (`_root_jvp`, `_solve_along`).
+
+If a search fails without need, look at the attempts in turn; if its result depends on the executor,
+compare the two iterations; if a derivative is wrong, look at `_root_jvp`.
 """
 
 import dataclasses

@@ -9,6 +9,10 @@ are the factors of the monodromy matrix. *Sizes* of states are their magnitudes 
 Searches call `ReturnMap.turn` and `turn_with_jacobian`, and get a `Return` or a `Turn`. There are
 two ways to the same Jacobians, which must agree: `_linear_on_host` (NumPy) and `_linear_in_program`
 (JAX). `judge` decides whether a turn is a cycle, and returns the reason if it is none.
+
+If a turn is wrong, compare these two ways; if both are wrong in the same way, look at `travel`, and
+at the search. If a good turn is refused, look at `judge`, and the limits `SINGULAR` and `CLOSED`;
+if conserved quantities drift, at `held`.
 """
 
 import dataclasses

@@ -1,9 +1,13 @@
-"""Find events of a *turn* (the flow once around a cycle) that happen at the same time.
+"""Find events of a *turn* (the flow once around the cycle) that happen at the same time.
 
 For each event, `rivals_of` returns a *rival*: a transition that nearby trajectories may meet before
 this event, or instead of it. All code that asks whether events coincide uses this rule: searches,
 sweeps and programs. Outside of programs, `coincidence.commutes` then compares the orders in which
 rivals may happen.
+
+If a cycle is refused because events coincide, and they do not, look at `rivals_of` (its three
+causes) and at `at_one_time`; if an event at the beginning of the turn is overlooked, at
+`_after_beginning`.
 """
 
 from typing import NamedTuple

@@ -8,6 +8,10 @@ guess, in the time of the fastest mode or of the clock. A size is at least large
 rounding errors of the field do not count: this matters for states that a symmetry keeps at zero.
 
 `stiff_charts` and `slow_time` estimate time scales from the eigenvalues of the field's derivative.
+
+If steps are too long or too short in one state, look at its size: before the cycle is known, at
+`sizes_near` (the modes in `_time_scale`), and then at `sizes_on`. If a chart counts as stiff and is
+not, look at `stiff_charts` and `STIFF`.
 """
 
 from collections.abc import Iterator, Mapping

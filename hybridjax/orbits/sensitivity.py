@@ -5,7 +5,10 @@ shape response curve, and the changes of the times between events are local timi
 Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
 
 `LimitCycle.sensitivity` calls `sensitivity`. `_sensitivity` drives the linear flow of the cycle
-(`linear_flow.py`) with a constant input, and closes it over one period (`responses.loop`).
+(`linear_flow.py`) with a constant input, and closes it over one period (`responses.closing`).
+
+If the period is wrong, look at `closing`; if only times of events are, at the delays of
+`LinearFlow.driven`; if they are all off by the same time, at `section_delay`.
 """
 
 from typing import Any
@@ -27,8 +30,8 @@ from ..systems.structure import Structure
 from ..systems.system import name_of
 from ..systems.varied import Varied
 from .crossing import AtEvent, ListLevels
-from .linear_flow import LinearFlow, by_name, linear_flow, with_inputs
-from .responses import Phases, loop
+from .linear_flow import LinearFlow, Phases, by_name, linear_flow, with_inputs
+from .responses import closing
 from .return_map import SINGULAR, ReturnMap, with_derivatives
 from .scale import in_sizes
 
@@ -98,7 +101,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     starts, late, total = (x[..., 0] for x in flow.driven(constant))
     both = map.valid[:, None] & map.valid
     whole = xp.where(both, total[:, 1:], 0.0)
-    closed, Z = loop(map, whole, f0)
+    closed, Z = closing(map, whole, f0)
     longer = -(Z @ total[:, 0])
     if clocked:
         longer = map.multiplicity * kernels.by_parameter_of_period(varied)

@@ -1,7 +1,10 @@
 """Newton's method on the starts of all moves of a turn at once, on the host.
 
 A *turn* is the flow from the section back to it, and a *move* is a step of it with the event at its
-end. If a nearby turn was recorded, all its moves are computed side by side from other starts:
+end. The turn is cut into *pieces*, and the search records its moves on a *tape*. A guard is *armed*
+if its next fall through zero is an event. *Sizes* are magnitudes of states.
+
+If a nearby turn was recorded, all its moves are computed side by side from other starts:
 `fixed_point` changes the starts until the moves join to a cycle; `travel` then makes each move by
 the search, to see that it is still right. This needs few calls of compiled functions, instead of
 one call for every step. (Multiple shooting: H. G. Bock and K. J. Plitt, IFAC Proceedings 17, 1984.)
@@ -91,8 +94,8 @@ def fixed_point(
         t = moves.t + shift[:, 0]
         q = moves.q + moved.T
         moves = moves._replace(t=t, q=q, h=h)
-        # (Newton's method converges quadratically: after a step, the error is about the square of
-        # the step.)
+        # (Newton's method converges quadratically: after a step as short as this, the error is
+        # about its square, and no further step is needed.)
         rtol = np.asarray(map.settings.rtol)
         if length <= np.maximum(CLOSED, rtol):
             return x, _forwards(moves)
@@ -102,12 +105,13 @@ def fixed_point(
 def _shift(
     map: ReturnMap, moves: Moves, x: Float[np.ndarray, " d"], target: Target
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "M n"], Float[np.ndarray, " M"]]:
-    """One Newton step: of the state at the anchor (in sizes), of (t, q) at the starts of moves, so
-    that the gaps between moves close, and of the lengths of moves."""
+    """One Newton step so that the gaps between moves close: the changes of the state at the anchor
+    (in sizes), and of (t, q) at the starts of moves; and the lengths of moves after it."""
     n = 1 + len(x)
     end, by = linear_moves(map.structure, moves, target)
     by_point = by[:, :, :n]
     starts = np.concatenate([moves.t[None], moves.q]).T
+    # (After the last move there is no start: its whole end is wanted.)
     between = end[:-1] - starts[1:]
     gaps = np.concatenate([between, end[-1:]])
     late = map.anchor.t[0] - starts[0, 0]
@@ -280,16 +284,18 @@ def _targets(moves: Moves, ends: Target) -> Target:
 def _searched(
     map: ReturnMap, lanes: Lanes, moves: Moves, target: Target, ends: Target
 ) -> tuple[Lanes, Any, Tape] | None:
-    """The lanes at the starts of moves, with their armed guards; the lanes at the ends; and the
-    tape. None if a move fails, or does not end as the next one begins."""
+    """The lanes at the starts of moves, whose armed guards are corrected in place; the lanes at the
+    ends; and the tape. None if a move fails, or does not end as the next one begins."""
     s = map.structure
-    setout = _setout(map, lanes, moves, target, ends)
+    first_steps = _first_steps(map, lanes, moves, target, ends)
     u = np.zeros((s.nu, len(moves.code)))
     options = Options(True, new_input=False, tangents=True)
     here = belongs(s, lanes.chart)[:-1, 1:]
     # (Twice: the first search tells which guards are armed at the start of each move.)
     for _ in range(2):
-        moved, tape = move(s, lanes, u, target, map.settings, setout, None, options)
+        moved, tape = move(
+            s, lanes, u, target, map.settings, first_steps, None, options
+        )
         end = moved.lanes
         before = end.armed[:, :-1]
         after = lanes.armed[:, 1:]
@@ -309,21 +315,20 @@ def _searched(
     return lanes, moved, tape
 
 
-def _setout(
+def _first_steps(
     map: ReturnMap, lanes: Lanes, moves: Moves, target: Target, ends: Target
 ) -> Stride:
-    """The first steps of moves."""
-    # (First steps are longer than the moves: otherwise rounding might divide a move in two, and a
-    # crossing must lie within the step.)
+    """The first steps of moves. They are longer than the moves: otherwise rounding might divide a
+    move in two, and a crossing must lie within the step."""
     to_time = np.where(moves.h > 0, 2 * moves.h, map.expected)
     is_to_time = np.isfinite(target.time)
     h = np.where(is_to_time, to_time, 1.01 * moves.h)
-    setout = stride(h)._replace(lead=0 * h)
+    steps = stride(h)._replace(lead=0 * h)
     s = map.structure
     if not has_implicit(s):
-        return setout
-    # (The deviation of a move is that of the move before, unless a piece or an event ended in
-    # between.)
+        return steps
+    # (Implicit methods estimate errors along a deviation of the state, which each move carries on
+    # from the move before, unless a piece or an event ended in between.)
     along = deviation(s, lanes, map.settings)
     _, by = linear_moves(s, moves, ends)
     by_state = by[:, 1:, 1 : 1 + s.d]
@@ -333,7 +338,7 @@ def _setout(
     for k in np.flatnonzero(goes_on):
         carried = by_state[k] @ along[:, k]
         along[:, k + 1] = carried
-    return setout._replace(along=along)
+    return steps._replace(along=along)
 
 
 def _largest_gap(map: ReturnMap, begin: Lanes, lanes: Lanes, end: Lanes) -> float:

@@ -13,6 +13,9 @@ is a multiple of the shortest one; multipliers that differ from those of the wal
 rounding errors. It does not notice a guard that dips below zero and back between two points of the
 walk (eight in each step), wrong multipliers of systems with more than `_MANY` states, or functions
 that do not mean what their author meant.
+
+Each finding has a function that makes it: if a good cycle is refused or a fault passes, look at
+that function and at the constants, which say what counts as a difference.
 """
 
 from collections.abc import Iterable

@@ -6,6 +6,10 @@ extrapolation: in explicit charts of the modified midpoint rule (W. B. Gragg, SI
 Analysis 2, 1965), in implicit ones of the linearly implicit Euler method (P. Deuflhard, SIAM Review
 27, 1985). Both, with their tables of differences, are in E. Hairer and G. Wanner, Solving Ordinary
 Differential Equations, vol. I, sec. II.9, and vol. II, sec. IV.9.
+
+If the verdict doubts a good cycle, compare the errors that `walk` returns with those of smaller
+steps: if they are too small, look at `_extrapolate`; if points on the way are wrong, at `_between`.
+The method must stay another one than that of the search.
 """
 
 from collections.abc import Callable

@@ -4,6 +4,9 @@ Each class has the methods of the protocol `Plant` (`drive.py`), which `find_cyc
 call: `reset(seed)` begins again, and `step(u, duration)` holds the inputs u and returns the signals
 by name. If the state can be set, there are `get_state` and `set_state`, too. A simulator of another
 package becomes a plant by one more class of this kind.
+
+If a run is not repeated exactly, look at `reset` and `set_state`; if a signal is late by a step, at
+the order in `step` and `_step_once`.
 """
 
 import dataclasses

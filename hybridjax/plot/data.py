@@ -1,4 +1,10 @@
-"""Figures of data: experiments, recordings, impulse responses, and the validation of a model."""
+"""Figures of data: experiments, recordings, impulse responses, phase responses, and the validation
+of a model.
+
+Each function draws one type of result. `first_of_data.py` registers them, so that `result.plot()`
+finds them. Most draw fields of the result as they are: if a figure shows wrong numbers, look at
+these first. A figure for a further type is a function here, and a line there.
+"""
 
 from typing import Any
 

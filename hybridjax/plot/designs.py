@@ -1,4 +1,9 @@
-"""Designs for a quantity of interest: their spectra, and standard errors against cycles."""
+"""Figures of designs for a quantity of interest: spectra (`spectrum`), and standard errors against
+cycles (`standard_errors`).
+
+Powers and errors are those of an `OptimalDesign` or a study: if one is wrong, look at
+`designs/optimize.py` or `designs/study.py`.
+"""
 
 from collections.abc import Mapping, Sequence
 

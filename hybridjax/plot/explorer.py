@@ -1,4 +1,14 @@
-"""Sliders for parameters: the limit cycle, its multipliers and its gain follow them."""
+"""`explore`: sliders for parameters; the limit cycle, its multipliers and its gain follow them.
+
+`Explorer` has the last cycle that was found and continues it to other parameters (`_follow`, in
+shorter steps where one fails). `_draw` moves the artists of one figure. In notebooks, the page
+`_PAGE` (JavaScript) and Python exchange two messages, `asked` and `answer` (`widget`, `_answer`).
+In scripts, `show` opens sliders of matplotlib.
+
+If a cycle is lost without need, look at `_follow`; if the picture is not that of the sliders, at
+`number`, `waiting` and `moved` in `_PAGE`; if moving is slow, at `_draw` (the gain takes as long as
+the cycle) and at what sets `_easel` to None, which draws the whole figure anew.
+"""
 
 import functools as ft
 from collections.abc import Mapping

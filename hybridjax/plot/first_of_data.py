@@ -1,4 +1,11 @@
-"""The figures of data and fits that one would ask for first (see `first`)."""
+"""The figures of data and fits that one would ask for first: `result.plot()` (see `first.py`).
+
+`first.draw` imports this file for types that it does not know itself. The figure of a type is
+registered with `draw.register`, or is drawn by a function here. A new type of result is one more
+such line; a subclass without a line gets the figure of its base class.
+
+If a result has no figure or the wrong one, look at its line here.
+"""
 
 from typing import Any
 

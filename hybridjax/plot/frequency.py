@@ -1,4 +1,13 @@
-"""Harmonic transfer functions against frequency (paper Figs. 3 and 4)."""
+"""Figures of harmonic transfer functions against frequency (paper Figs. 3 and 4): `htf` and `bode`.
+
+Both sort HTFs such that exact ones lie below estimates (`_exact_first`, which also evaluates
+models), and read curves with the radii of their confidence discs by `_values`. `htf` draws
+magnitudes (`_magnitude`), `bode` magnitudes and phases (`_BodePanels`, with the axes of `_Scale`).
+A dict of HTFs becomes a grid of such panels (`_grid`).
+
+If a curve or a band is at wrong values, look at `_values`; if a phase is off by whole turns or
+missing, at `_phase` and at `is_certain` in `_BodePanels.response`; if units are wrong, at `_Scale`.
+"""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence

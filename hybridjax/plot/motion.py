@@ -1,4 +1,15 @@
-"""Animations: the mechanism, its orbit with sections and events, and its multipliers."""
+"""Animations: the mechanism, its orbit with sections and events, and its multipliers.
+
+`animate` takes the stages in order: what moves (`_motions`), the times of frames (`_tracks`), and
+panels that each add *parts* (`_film`): an artist, the function that moves it, and its argument for
+each frame. All arguments are computed in advance, so that a frame only moves artists; `Motion`
+plays and writes them (`film.py`). A branch has one cycle in each frame (`_of_branch`). The explorer
+uses `portrait`, too.
+
+A new panel is a function that returns parts, called in `_film`. If the speed is wrong, look at
+`_pace`; if something is drawn at a wrong time, at `Track.wrapped`; if an event flashes at a wrong
+time, at `Track.events`; if the mechanism is at a wrong place, at `pictures.py`.
+"""
 
 import itertools
 import math
@@ -45,7 +56,8 @@ from .pictures import Pictures, drawing_of
 from .plane import multipliers as draw_multipliers
 
 
-_RATE = 25  # frames per second
+# Frames per second. More: larger files. Fewer: motions stutter.
+_RATE = 25
 _GROUND: dict[str, Any] = {"color": COLORS["gray"], "lw": 1.0, "zorder": 1}
 _MARKS: dict[str, Any] = {"marker": [(0, 0), (-3, -4)], "ms": 8}
 _LINK: dict[str, Any] = {"lw": 1.6, "zorder": 3, "solid_joinstyle": "round"}

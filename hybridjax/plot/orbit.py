@@ -1,4 +1,12 @@
-"""A limit cycle in phase space (paper Fig. 1)."""
+"""A limit cycle in phase space (paper Fig. 1): `cycle`.
+
+It draws the orbit by charts (`by_chart`), the arrow of its direction, events with their names
+(`_events`, `_text`) and bars for sections (`_sections`, `_meetings`). Animations use `plane_of`,
+`by_chart` and `at_events`, too.
+
+If a line joins points that a reset separates, look at `by_chart`; if a name covers the orbit, at
+the constants and `_text`; if a bar has a wrong direction, at `_meetings`.
+"""
 
 import itertools
 from collections.abc import Iterator
@@ -206,20 +214,31 @@ def at_events(
 
 
 def _events(ax: Axes, s: Structure, orbit: Trajectory, names, center) -> None:
+    """Dots for events, and the name of each transition at its first event."""
     texts: dict[tuple, dict[str, None]] = {}  # names of what happens at a point
     for g, before, after in zip(*at_events(orbit, *names), strict=True):
-        name = s.transitions[g].name
         if not np.all(np.isfinite([before, after])):
             continue
-        rounding = 1e-9 * (1 + np.abs(before))
-        if np.any(np.abs(after - before) > rounding):
-            reset = np.stack([before, after], axis=1)
-            ax.plot(*reset, "--", color="black", lw=0.8, zorder=2)
-            ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
-        ax.plot(*before, "o", ms=4, color="black", zorder=5)
+        _event(ax, before, after)
+        name = s.transitions[g].name
         if not any(name in there for there in texts.values()):
             texts.setdefault(tuple(before.round(9)), {})[name] = None
     ax.autoscale_view()
+    _names(ax, texts, center)
+
+
+def _event(ax: Axes, before: np.ndarray, after: np.ndarray) -> None:
+    """A dot, and where the reset moves the point, a dashed line to an open dot."""
+    rounding = 1e-9 * (1 + np.abs(before))
+    if np.any(np.abs(after - before) > rounding):
+        reset = np.stack([before, after], axis=1)
+        ax.plot(*reset, "--", color="black", lw=0.8, zorder=2)
+        ax.plot(*after, "o", ms=4, mfc="white", mec="black", mew=0.8, zorder=5)
+    ax.plot(*before, "o", ms=4, color="black", zorder=5)
+
+
+def _names(ax: Axes, texts: dict[tuple, dict[str, None]], center) -> None:
+    """The names of events beside their points, where they cover little of the orbit."""
     solid = [x for x in ax.get_lines() if x.get_linestyle() == "-"]
     lines = [np.asarray(x.get_xydata()) for x in solid]
     drawn = ax.transData.transform(np.vstack(lines))

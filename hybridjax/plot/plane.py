@@ -1,4 +1,10 @@
-"""Floquet multipliers, poles and zeros in the complex plane."""
+"""Figures in the complex plane: multipliers (`multipliers`), poles and zeros (`poles_zeros`).
+
+True values are crosses, estimates open markers; `_values` and `_series` read both from any result,
+`_borders` the 95 % confidence regions. `_zoom` decides whether an inset around the leading
+multiplier is drawn, and where. If a distance in the legend is wrong, look at `compare_multipliers`
+(`identify/multiplier_estimate.py`), which pairs estimates with true values.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,11 @@
-"""The return map of one coordinate, with its cobweb."""
+"""`return_map`: the return map of one coordinate, with its cobweb.
+
+States are drawn on a line through the cycle, along an eigenvector of the map (`_Line.through`), and
+flow for one period (`_Line.next`, by `sections/maps.py`). The constants set what is drawn; the
+slope in the legend is the multiplier of the cycle and does not depend on them. If the dashed
+tangent does not touch the map, compare `_jacobian` with the cycle's multipliers; if the map has
+gaps, states did not return within `_PATIENCE` periods.
+"""
 
 from collections.abc import Sequence
 from typing import Annotated, NamedTuple

@@ -1,4 +1,9 @@
-"""Figures of populations: forest plots, paired dots, and curves or maps of subjects."""
+"""Figures of populations: forest plots (`forest`), paired dots, and curves or maps of subjects
+(`subject_maps`).
+
+They draw tables and maps that `recordings/population/` computed: if an estimate, an interval or a
+band is wrong, look there.
+"""
 
 import numpy as np
 

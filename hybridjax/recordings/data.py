@@ -2,7 +2,9 @@
 the average cycle.
 
 `sample_sections` (`sampling.py`) makes it, and all estimates from recordings take it. Its `records`
-have the form that fits to time series use.
+have the form that fits to time series use. Nothing is sampled here: if a deviation is wrong, look
+at `sampling.py`. If the band of an input is too narrow or too wide, look at `LEAST_POWER` and
+`input_spectrum`.
 """
 
 from collections.abc import Sequence

@@ -4,6 +4,8 @@
 `about_natural_multipliers` and `about_phase_response`. Each function below yields the findings of
 one kind, and the constants are their limits. Findings about the signals themselves are made in
 `inspection/`.
+
+If a finding is missed or needless, look at the constant of its function.
 """
 
 from collections.abc import Iterator, Sequence

@@ -2,7 +2,8 @@
 
 Each trial has stretches (`Winding`) without long gaps, in which time and phase determine each
 other. `samples` and `by_trial` give data and stretches together. The phase itself is computed in
-`phase_estimation.py`.
+`phase_estimation.py`: if a cycle is missing or doubled, look there. If a time between events is
+wrong, look at `Winding.when`, which interpolates.
 """
 
 from typing import Any

@@ -3,6 +3,10 @@
 All files of `recordings` that evaluate a signal between its samples call `spline` (or `means`), and
 ask `bridgeable` and `gaps` which gaps are too long. `spike_heights` finds isolated wrong samples.
 Time series are arrays (n,), with NaN for missing samples.
+
+The constants say what counts as a spike. If a good sample is left out or a spike stays in, look at
+`spike_heights` (and `input_spikes` for inputs), which tests each condition in turn; if a signal is
+too smooth, at `_smoothed` and the bandwidth.
 """
 
 from typing import Annotated, Any

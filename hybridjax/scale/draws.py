@@ -1,4 +1,10 @@
-"""Many draws of a random computation."""
+"""`monte_carlo`: many draws of a random computation, in pieces, by any number of processes.
+
+It makes the job `Draws`, and `fill` (`_core/pieces/run.py`) runs it. Draw i has its own stream of
+random numbers (`_draw`): results do not depend on pieces, processes or interruptions, and this must
+stay so. `begin` finds the form of the results from the first draw that succeeds. If draws are
+refused for their names or shapes, look at `run` and at `wanted.stacked`.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping

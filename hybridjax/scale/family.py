@@ -1,4 +1,11 @@
-"""Systems as a function of parameters, and the points at which a sweep evaluates them."""
+"""Systems as a function of parameters (`Family`), and the points at which a sweep evaluates them
+(`SweepPoints` of users, `Space` within a sweep).
+
+`sweeps.py` calls both. A `Family` is a system some of whose parameters vary, or a function of
+parameters that returns a system. `Family.describe` is the part of a sweep's description by which a
+store recognizes the model. If a point gets the values of another one, look at `Space.at`; if a
+changed model is not noticed, at `Family.describe`.
+"""
 
 import contextlib
 import dataclasses

@@ -1,4 +1,17 @@
-"""Limit cycles over a space of parameters."""
+"""`sweep`: limit cycles over a space of parameters, in pieces, by any number of processes.
+
+`sweep` makes a `SweepJob` from the points and the systems (`family.py`) and the quantities to keep
+(`wanted.py`), and `fill` (`_core/pieces/run.py`) runs it: `begin` once, then `run` for each piece,
+here or on workers, which call `resume` first. Cycles themselves are found by `solved`
+(`orbits/limit_cycles.py`).
+
+Results must not depend on the process that computes a piece: all pieces start from the same cycles
+of a coarse pass, and the guess is rounded (`_rounded`). The `description` decides whether a store
+holds the same sweep: what changes results must be in it.
+
+If the results of two runs differ, look at `_rounded` and `Begun`; if a store is refused without
+need, at the `description` in `sweep`; if a cycle is missing, at `orbits/limit_cycles.py`.
+"""
 
 import dataclasses
 import math

@@ -1,4 +1,11 @@
-"""Quantities that a sweep keeps of limit cycles."""
+"""`Wanted`: the quantities that a sweep keeps of limit cycles, by name or as functions of users.
+
+`sweeps.py` calls `variables` once for the names, axes and types of results, and `values` for the
+cycles of each piece; `draws.py` uses the functions at the end. A new quantity is a name in `Want`,
+a line in `Wanted._values`, and its axes and units in `Wanted.variables`. If a value is NaN without
+need, look at `_values` (cycles that were not found) or `_measured` (a user's function that raises
+`ComputationError`).
+"""
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -4,6 +4,9 @@
 cycle misses, touches, crosses twice or meets in another order. The text of the error has the values
 at which the section would be crossed once (`_remedy`). A *level* is a function that falls through
 zero at its section.
+
+If a good section is refused, look at the constants, and at the function that `check_placed` calls
+for this error; if the remedy names wrong values, at `_met`.
 """
 
 from typing import NamedTuple

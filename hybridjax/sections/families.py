@@ -4,6 +4,10 @@ arc lengths or angles, or given one by one.
 A family is a definition and belongs to no cycle. `place_sections` (`place.py`) calls its method
 `bind` with points of a limit cycle (`Orbit`), and gets `BoundSections`: where each section ends a
 piece of flow. A new kind of family is added here, as a subclass.
+
+If sections lie at wrong phases, look at `bind` of the family, and at `_first` (the anchor); if an
+angle is wrong, at `_AngleLevels.level` and `KinematicPhase._scaled`. If sections are placed well
+and crossed wrongly, look at `locate.py`.
 """
 
 import abc

@@ -5,6 +5,9 @@
 to the cycle (`_bind`), flows to section 0, and then from each section to the next. On the host, the
 recorded steps of the cycle are used if they are known (`along.py`); otherwise there is a search.
 Results are checked in `checks.py`.
+
+If a section is placed at a wrong time, look at `_bind` (clock sections), and at `along.py` or the
+search (others); if the order is wrong, at `place_in_order`.
 """
 
 import dataclasses

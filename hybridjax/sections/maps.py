@@ -3,6 +3,9 @@
 `section_map` returns a `SectionMap`, which users call with a state on section i. It flows to
 section j (`_arrivals`) and returns an `Arrival`. `plot/returns.py` calls `arrivals` for many states
 at once.
+
+If a map is wrong, compare it with `linearize` at the cycle; if a state does not arrive, look at
+`_PATIENCE` and at the search.
 """
 
 import dataclasses

@@ -4,6 +4,9 @@ It returns `PlacedSections`. The sections are located in `locate.py`; inside of 
 they are located along the recorded itinerary of a known cycle if there is one (`walk.py`).
 `place_along` computes derivatives of placed sections on the host, for `linearize`. `observed_at`
 gives only the times of sections and the outputs, for fits.
+
+If sections lie at wrong places, look at `locate.py`; if only their derivatives are wrong, at
+`place_along` (host) or `walk.py` (programs), which must agree.
 """
 
 import dataclasses

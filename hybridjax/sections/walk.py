@@ -6,6 +6,9 @@ nothing searches, a neighboring cycle follows it: one run gives times and states
 and the derivatives of the flow from each section to the next. `place.py` and `linearization.py`
 call `walk_beside` (is there a walk?) and `walked`. Sections that leave the walk have a result code.
 A *leg* is a part between two events or sections.
+
+If sections leave the walk without need, look at the flags (`engine/itinerary/flags.py`); if their
+times are wrong, at `_known_ends` and `_bound`.
 """
 
 import dataclasses

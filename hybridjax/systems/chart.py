@@ -1,7 +1,9 @@
 """`Chart`: one mode of a hybrid system, with its own states and its own vector field.
 
 Users subclass `Chart`; `FieldChart` makes a chart from a function, and `DerivedChart` changes parts
-of another chart. The engine reads charts through `structure.py`.
+of another chart. The engine reads charts through `structure.py`. The names of attributes are public
+and must not change. If a chart of a user is refused, look at `Chart.__new__` and `_require_names`;
+if its motion is wrong, at its own `field`.
 """
 
 import abc
@@ -61,7 +63,8 @@ class Chart(eqx.Module):
     solver: ClassVar[Solver | Method | None] = None
 
     def __new__(cls, *args: Any, **options: Any):
-        # (Some charts of this package have their states as a field.)
+        # (States are a class attribute; `FieldChart` has them as a field, and `DerivedChart` as a
+        # property.)
         fields = {field.name for field in dataclasses.fields(cls)}
         is_named = hasattr(cls, "states") or "states" in fields
         if is_named and not cls.__abstractmethods__:
@@ -112,6 +115,7 @@ def _require_names(cls: type) -> None:
 class FieldChart(Chart):
     """A chart whose field is a function (t, q, u), such as a method of its system."""
 
+    # (Checkers of types object that fields take the place of class attributes.)
     function: Callable[..., Any]
     states: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]
     units: tuple[str, ...] = eqx.field(static=True)  # type: ignore[misc]

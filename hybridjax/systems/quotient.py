@@ -2,10 +2,18 @@
 
 Two kinds of symmetry are possible: charts are mirror images of each other (legs change their
 roles), and a translation of some states has no effect (the distance walked). `Symmetric` keeps one
-chart of each pair and leaves out the translated states. A transition into a chart that is left out
-leads to its mirror image (`_landing`). `check_symmetry` tests, at points of the cycle, the
-statements (`_claims`) that would follow from the symmetry: if it refuses a symmetry that is right,
-look there.
+chart of each pair and leaves out the translated states (`_Reduced`). A transition into a chart that
+is left out leads to its mirror image (`_landing`). With `half_period`, all charts are kept, and one
+more transition mirrors the state (`_halves`).
+
+`check_symmetry` tests, at random points, the statements (`_claims`) that would follow from the
+symmetry: the functions of a chart (`_View`) are those of its image, and do not depend on the
+translation. `_View` says again what `_Reduced.field`, `_transition` and `outputs` do: a change
+there needs one in `_View`.
+
+If a symmetry that is right is refused, look at `_mirrored` (order and signs of states) and `_View`.
+If multipliers are wrong without an error, look at `_landing` (which chart) and, with `half_period`,
+at `_halves` and the clock in `_transition`.
 """
 
 import math
@@ -55,18 +63,20 @@ class Symmetric(Derived):
     - `flipped`: states that change their sign in the mirror.
     - `translation`: states that have no effect on others, nor on outputs, such as the position
         along the floor. They are left out.
-    - `half_period`: for cycles with x(t + T/2) = S x(t), with S from the arguments above. For a
-        system that is driven by a clock: True. Otherwise: the name of a state, or a function of (t,
-        q), that changes its sign under S and rises through zero once per half period. At this zero,
-        or after half a period of the clock, the transition "half period" (with several charts,
-        "half period (chart)") replaces the state by its mirror image. The multipliers of the full
-        cycle are the squares of those of this half map. All charts are kept. In a chart that is its
-        own mirror image, list the transitions such that the last is the image of the first, the
-        last but one that of the second, and so on. A clock becomes the state `clock`, the time
-        since the transition, so that the system is autonomous. Default: False.
+    - `half_period`: True for a system that is driven by a clock. Otherwise: the name of a state, or
+        a function of (t, q), that changes its sign under the symmetry and rises through zero once
+        per half period. Default: False.
 
     Inputs act on the state in the charts that are kept, which is the mirrored one in every second
     step. With `half_period`, they act on the mirrored state in every second half of a cycle.
+
+    **Half periods:** `half_period` is for cycles with x(t + T/2) = S x(t), with S from the other
+    arguments. At the zero of the function, or after half a period of the clock, the transition
+    "half period" (with several charts, "half period (chart)") replaces the state by its mirror
+    image. The multipliers of the full cycle are the squares of those of this half map. All charts
+    are kept. In a chart that is its own mirror image, list the transitions such that the last is
+    the image of the first, the last but one that of the second, and so on. A clock becomes the
+    state `clock`, the time since the transition, so that the system is autonomous.
 
     **Raises:** `DefinitionError` if charts or states do not fit together. When a cycle or a
     trajectory is computed, `DefinitionError` if a function does not have the symmetry; the message
@@ -106,7 +116,7 @@ class Symmetric(Derived):
 
     @property
     def swap(self) -> dict[str, str]:
-        """The mirror image, which is left out, of each chart that is kept."""
+        """The mirror image of each chart that is kept; with `half_period`, of every chart."""
         return dict(self.pairs)
 
     @property
@@ -159,16 +169,17 @@ class Symmetric(Derived):
 
     def transitions(self):
         events = [x for x in self.system.transitions() if x.source not in self._kept_of]
-        made = [self._transition(x, self._kept_of, 1.0) for x in events]
-        return made + [self._transition(x, self.swap, 0.0) for x in self._halves()]
+        halves = [self._transition(x, self.swap, False) for x in self._halves()]
+        return [self._transition(x, self._kept_of, True) for x in events] + halves
 
     def _transition(
         self,
         x: Transition,
         images: Mapping[str, str],
-        clock: float,
+        keeps_clock: bool,
     ) -> Transition:
-        """A transition, with the state in the image of its target; the clock is multiplied."""
+        """A transition of the original system, which leads to the image of its target. The state
+        `clock` goes on, or starts again at 0."""
         chart = self._reduced(x.source)
         guard = x.guard
         direction = x.direction
@@ -179,11 +190,12 @@ class Symmetric(Derived):
             guard = chart.lifted(_phase_of(guard))
             direction = "rising"
         enabled = None if x.enabled is None else chart.lifted(x.enabled)
-        at = chart.lifted(landed)
+        state_after = chart.lifted(landed)
         n = len(chart.kept)
+        factor = 1.0 if keeps_clock else 0.0
 
-        def reset(*point):
-            return jnp.append(at(*point), clock * point[1][n:])
+        def reset(t, q, u):
+            return jnp.append(state_after(t, q, u), factor * q[n:])
 
         return Transition(x.name, x.source, target, guard, direction, reset, enabled)
 
@@ -234,17 +246,20 @@ class Symmetric(Derived):
     def draw(self, chart: str, t: Float[Array, ""], q: Mapping[str, Any]):
         """Return the picture of the original system at the translation 0. Its
         `velocity` is the speed of the translation."""
-        whole = self.system.charts()[chart]
-        still = dict.fromkeys(self.translation, 0.0)
         time = q["clock"] if self.charts()[chart].clocked else t
-        drawing = self.system.draw(chart, time, {**q, **still})
+        states = {**q, **dict.fromkeys(self.translation, 0.0)}
+        drawing = self.system.draw(chart, time, states)
         if drawing is None or len(self.translation) != 1:
             return drawing
-        values = {**still, **q}
-        state = jnp.stack([jnp.asarray(values[x], float) for x in whole.states])
-        rates = as_vector(whole.field(t, state, jnp.zeros(len(self.inputs))))
-        along = rates[whole.states.index(self.translation[0])]
-        return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([along, 0 * along]))
+        speed = self._speed(chart, time, states)
+        return eqx.tree_at(lambda x: x.velocity, drawing, jnp.stack([speed, 0 * speed]))
+
+    def _speed(self, chart: str, time: Any, states: Mapping[str, Any]):
+        """The rate of the only translated state, without inputs."""
+        whole = self.system.charts()[chart]
+        q = jnp.stack([jnp.asarray(states[x], float) for x in whole.states])
+        rates = as_vector(whole.field(time, q, jnp.zeros(len(self.inputs))))
+        return rates[whole.states.index(self.translation[0])]
 
     def whole(self, at: Guess) -> tuple[HybridSystem, Guess] | None:
         """With `half_period`: the original system, whose cycle has both halves, and the given state
@@ -260,87 +275,35 @@ class Symmetric(Derived):
 
     def _claims(self, sizes: Mapping[str, Any]):
         """Iterate over the statements of the symmetry. Each is a sentence for the error, and two
-        functions of (t, q, u) that must be equal. The first numbers of q are the state without
-        translated states, in units of `sizes`."""
+        functions of (t, q, u) that must be equal (see `_View`)."""
         if self.translation:
             yield from self._claims_of_translation(sizes)
         clock: Any = self.system.period()
         images = self.swap if self.half_period else self._kept_of
         later = 0.5 * clock if self.half_period is True else 0.0
-        for kept, other in self.swap.items():
-            ours = list(self._parts(kept, self._kept_of, sizes))
+        for kept, image in self.swap.items():
+            ours = list(_View(self, kept, self._kept_of, sizes).functions())
+            view = _View(self, image, images, sizes, later=later)
             # In a chart that is its own mirror image, the last transition is the mirror image of
             # the first.
-            back = kept == other
-            theirs = list(self._parts(other, images, sizes, later=later, back=back))
+            theirs = list(view.functions(reversed_order=kept == image))
             if len(ours) != len(theirs):
                 sentence = (
-                    f"'{kept}' and '{other}' have different numbers of transitions"
+                    f"'{kept}' and '{image}' have different numbers of transitions"
                 )
                 yield sentence, lambda *_: 0.0, lambda *_: 1.0
-            for (what, function), (name, image) in zip(ours, theirs, strict=False):
+            for (what, function), (name, mirrored) in zip(ours, theirs, strict=False):
                 sentence = f"the {name} is not the mirror image of the {what}"
-                yield sentence, function, image
+                yield sentence, function, mirrored
 
     def _claims_of_translation(self, sizes: Mapping[str, Any]):
         for name in self.system.charts():
-            here = self._parts(name, self._kept_of, sizes, shift=0.0)
-            there = self._parts(name, self._kept_of, sizes, shift=0.7)
-            for (what, before), (_, after) in zip(here, there, strict=True):
-                yield f"the {what} changes under the translation", before, after
-
-    def _parts(self, name, images, sizes, shift=None, later=0.0, back=False):
-        """All functions of a chart, as functions of points of the reduced chart. Rates and states
-        are mirrored if the chart is among the `images`. With `back`, transitions are in reverse
-        order. With `shift`, states are translated by it, and outputs are included."""
-        kept = images.get(name, name)
-        chart = self._reduced(kept)
-        original = self.system.charts()[name]
-        mirrored = self._mirrored if name in images else _same
-        n = len(chart.kept)
-        moves = np.isin(chart.chart.states, self.translation)
-        size = sizes[kept][:n]
-        used = slice(None if original.inputs is None else len(original.inputs))
-
-        def at(function, *scale):
-            """A function of the original chart, divided by a scale, of a reduced point."""
-
-            def of_reduced(t, q, u):
-                whole = chart.full(size * q[:n], shift or 0.0)
-                state = mirrored(kept, whole)
-                value = function(t + later, state, u[used])
-                return value / scale[0] if scale else value
-
-            return of_reduced
-
-        def rates(*point):
-            return mirrored(kept, as_vector(original.field(*point)), back=True)
-
-        field = f"field of chart '{name}'"
-        yield field, at(lambda *point: chart.less(rates(*point)), size)
-        yield field, at(lambda *point: rates(*point)[moves])
-        transitions = [x for x in self.system.transitions() if x.source == name]
-        if back:
-            transitions.reverse()
-        for x in transitions:
-            target, reset = self._landing(x, images)
-            into = sizes[target][: len(self._reduced(target).kept)]
-            guard = _phase_of(x.guard) if isinstance(x.guard, Scheduled) else x.guard
-            yield f"transition '{x.name}'", at(reset, into)
-            yield f"transition '{x.name}'", at(guard, x.sign)
-        if shift is not None:
-            yield from self._output_parts(name, at)
-        if self.system.period() is None:
-            sign = -1.0 if name in images else 1.0
-            for x in self._halves():
-                if x.source == name and callable(x.guard):
-                    yield f"sign of '{x.name}'", at(x.guard, sign)
-
-    def _output_parts(self, name, at):
-        for x in self.system.outputs():
-            function = x.in_chart(name)
-            if function is not None:
-                yield f"output '{x.name}'", at(function)
+            here = _View(self, name, self._kept_of, sizes, shift=0.0)
+            there = _View(self, name, self._kept_of, sizes, shift=0.7)
+            before = [*here.functions(), *here.outputs()]
+            after = [*there.functions(), *there.outputs()]
+            for (what, first), (_, second) in zip(before, after, strict=True):
+                yield f"the {what} changes under the translation", first, second
 
     def _reduced(self, name: str) -> "_Reduced":
         clocked = bool(self.half_period) and self.system.period() is not None
@@ -354,26 +317,118 @@ class Symmetric(Derived):
         mirrored = self._mirrored if x.target in images else _same
 
         def reset(t, q, u):
-            new = mirrored(target, as_vector(x.reset(t, q, u)), back=True)
-            return self._reduced(target).less(new)
+            after = mirrored(target, as_vector(x.reset(t, q, u)), from_image=True)
+            return self._reduced(target).less(after)
 
         return target, reset
 
     def _partner(self, name: str) -> str:
         return dict(self.names).get(name, name)
 
-    def _mirrored(self, kept: str, q: Any, back: bool = False):
-        """The mirror image of a state of a chart that is kept, or with `back`, of a state of its
-        image."""
+    def _mirrored(self, kept: str, q: Any, from_image: bool = False):
+        """The mirror image of a state of a chart that is kept, or of a state of the image of this
+        chart."""
         charts = self.system.charts()
         source = charts[kept].states
         target = charts[self.swap[kept]].states
-        if back:
+        if from_image:
             source, target = target, source
         order = [source.index(self._partner(name)) for name in target]
-        names = target if back else [self._partner(x) for x in target]
-        signs = np.where([x in self.flipped for x in names], -1.0, 1.0)
+        in_kept = target if from_image else [self._partner(x) for x in target]
+        signs = np.where([x in self.flipped for x in in_kept], -1.0, 1.0)
         return q[np.array(order)] * signs
+
+
+class _View:
+    """The functions of a chart of the original system, for comparisons, as functions of points (t,
+    q, u) of its reduced chart.
+
+    The first numbers of q are the state without translated states, in units of `sizes`. For a chart
+    among the `images`, {chart: its mirror image}, the points are those of the image, and states and
+    rates are mirrored. Translated states are `shift`, and the time is later by `later`.
+    """
+
+    def __init__(
+        self,
+        symmetric: Symmetric,
+        name: str,
+        images: Mapping[str, str],
+        sizes: Mapping[str, Any],
+        shift: float = 0.0,
+        later: Any = 0.0,
+    ):
+        self.symmetric = symmetric
+        self.system = symmetric.system
+        self.name = name
+        self.images = images
+        self.sizes = sizes
+        self.shift = shift
+        self.later = later
+        self.kept_chart = images.get(name, name)
+        self.chart = self.system.charts()[name]
+        self.reduced = symmetric._reduced(self.kept_chart)
+        self.mirrored = symmetric._mirrored if name in images else _same
+
+    def at(self, function: Callable, scale: Any = None) -> Callable:
+        """A function of the chart, divided by a scale, as a function of reduced points."""
+        n = len(self.reduced.kept)
+        size = self.sizes[self.kept_chart][:n]
+        inputs = self.chart.inputs
+        used = slice(None if inputs is None else len(inputs))
+
+        def of_reduced(t, q, u):
+            whole = self.reduced.full(size * q[:n], self.shift)
+            state = self.mirrored(self.kept_chart, whole)
+            value = function(t + self.later, state, u[used])
+            return value if scale is None else value / scale
+
+        return of_reduced
+
+    def functions(self, reversed_order: bool = False):
+        """Iterate over the names and functions of field and transitions."""
+        yield from self._fields()
+        yield from self._transitions(reversed_order)
+        yield from self._ends_of_halves()
+
+    def outputs(self):
+        """Iterate over the names and functions of outputs."""
+        for x in self.system.outputs():
+            function = x.in_chart(self.name)
+            if function is not None:
+                yield f"output '{x.name}'", self.at(function)
+
+    def _fields(self):
+        reduced = self.reduced
+        moves = np.isin(reduced.chart.states, self.symmetric.translation)
+        size = self.sizes[self.kept_chart][: len(reduced.kept)]
+
+        def rates(t, q, u):
+            original = as_vector(self.chart.field(t, q, u))
+            return self.mirrored(self.kept_chart, original, from_image=True)
+
+        title = f"field of chart '{self.name}'"
+        yield title, self.at(lambda *point: reduced.less(rates(*point)), size)
+        yield title, self.at(lambda *point: rates(*point)[moves])
+
+    def _transitions(self, reversed_order: bool):
+        transitions = [x for x in self.system.transitions() if x.source == self.name]
+        if reversed_order:
+            transitions.reverse()
+        for x in transitions:
+            target, reset = self.symmetric._landing(x, self.images)
+            size_after = self.sizes[target][: len(self.symmetric._reduced(target).kept)]
+            guard = _phase_of(x.guard) if isinstance(x.guard, Scheduled) else x.guard
+            yield f"transition '{x.name}'", self.at(reset, size_after)
+            yield f"transition '{x.name}'", self.at(guard, x.sign)
+            yield f"`enabled` of transition '{x.name}'", self.at(_enabled(x))
+
+    def _ends_of_halves(self):
+        if self.system.period() is not None:
+            return
+        sign = -1.0 if self.name in self.images else 1.0
+        for x in self.symmetric._halves():
+            if x.source == self.name and callable(x.guard):
+                yield f"sign of '{x.name}'", self.at(x.guard, sign)
 
 
 @jax.ensure_compile_time_eval()
@@ -398,9 +453,11 @@ def check_symmetry(
     t = rng.normal(size=3) * (1.0 if clock is None else clock)
     values = _sides(system, sizes, q, t, along)
     for (sentence, *_), pair in zip(system._claims(sizes), values, strict=True):
-        size = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
-        x, y = (values / size for values in pair)
-        if x.shape != y.shape or not np.allclose(x, y, rtol=0, equal_nan=True):
+        largest = np.nanmax(np.abs(pair[0]), initial=0.0) or 1.0
+        left, right = (side / largest for side in pair)
+        if left.shape != right.shape or not np.allclose(
+            left, right, rtol=0, equal_nan=True
+        ):
             once = f" once {along!r} changes" if along else ""
             raise DefinitionError(
                 f"{name_of(system.system)} does not have the symmetry of its "
@@ -430,8 +487,17 @@ def _sides(quotient: Any, sizes: Any, q: Any, t: Any, along: str | None) -> list
     return jax.vmap(at_a_point)(q, t)
 
 
-def _same(kept: str, q: Any, back: bool = False):
+def _same(kept: str, q: Any, from_image: bool = False):
+    """The state itself, where `_mirrored` would mirror it."""
     return q
+
+
+def _enabled(x: Transition) -> Callable:
+    """Whether a transition may happen: 1 or 0."""
+    enabled = x.enabled
+    if enabled is None:
+        return lambda t, q, u: 1.0
+    return lambda t, q, u: jnp.asarray(enabled(t, q, u), float)
 
 
 def _phase_of(guard: Scheduled) -> Callable:

@@ -3,7 +3,8 @@ package.
 
 `as_method` converts any of these to a `Method`: the coefficients, in the form that
 `engine/runge_kutta.py` uses. `solvers` checks what a user gives for a system (one solver, or one
-for each chart).
+for each chart). If a solver is refused, look at the conditions in `_as_method`; if its errors are
+of the wrong order, at its coefficients (`_from_tableau`, `_radau`) and at `Method.order`.
 """
 
 import functools as ft

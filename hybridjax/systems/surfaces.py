@@ -3,7 +3,9 @@ point towards the surface.
 
 `filippov` returns the charts (two sides, and a `SlidingChart`) and the transitions between them.
 The field of sliding is the combination of both fields that is tangent to the surface
-(`SlidingChart.field`).
+(`SlidingChart.field`). If a state slides that should cross, or the reverse, look at the conditions
+`held` and `borne`, and at the signs of `SlidingChart.rates`; if pushes have a wrong effect, at
+`SlidingChart.returned`.
 
 A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, 1988; V. I. Utkin,
 Sliding Modes in Control and Optimization, 1992.

@@ -4,6 +4,11 @@ a clock.
 With it are `Output`, `parameter` and `Guess`. `Derived` changes parts of another system, and
 `Driven` adds an input that is a function of time. The engine reads systems through `structure.py`;
 a system is checked in `check.py`.
+
+Names of attributes and methods are public and must not change. If a parameter has a wrong type or
+loses its derivative, look at `parameter` and `_number`; if a system from `from_functions` calls its
+functions wrongly, at `taken_by_position` and `_with_parameters`; if a stored result is not
+recognized, at `describe`.
 """
 
 import abc

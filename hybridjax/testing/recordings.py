@@ -1,4 +1,10 @@
-"""Recordings whose truth is known, to try a method before an animal is measured."""
+"""Recordings whose truth is known, to try a method before an animal is measured.
+
+`simulate_recording` applies a sampled force to a system, `simulate_beats` an input to a phase
+model, and `add_artifacts` corrupts a recording. The tests of the estimates from recordings rely on
+their accuracy. If a simulated signal is wrong, look at the steps of the force in
+`simulate_recording`, and otherwise at `experiments/response.py`; if events are late, at `_STEP`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace

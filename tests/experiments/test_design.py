@@ -192,6 +192,30 @@ def test_designs_that_break_a_rule_name_what_breaks_it(message):
         hj.experiments.Design.from_lines(BAD[message], n_sections=8, periods=8)
 
 
+def test_cosines_by_hand_are_in_the_order_of_experiments():
+    """Parts of signals are found by their places."""
+    experiment = np.array([1, 0])
+    line = np.array([1, 2])
+    ones = np.ones(2)
+    with pytest.raises(hj.errors.DefinitionError, match="`experiment` must ascend"):
+        hj.experiments.Design(experiment, line, 0 * line, ones, ones, 8, 8, 2)
+
+
+def test_a_cosine_that_stands_twice_is_named_and_not_a_line_of_two_inputs():
+    frequencies = [[0.125, 0.125, 0.25, 0.25], [0.125, 0.125]]
+    with pytest.raises(
+        hj.errors.DefinitionError, match="experiment 0: f = 0.25 is excited twice"
+    ):
+        hj.experiments.Design.from_lines(
+            frequencies,
+            phases=[[0.0, 1.0, 0.0, 0.0], [0.0, 2.0]],
+            channels=[[0, 1, 0, 0], [0, 1]],
+            inputs=2,
+            n_sections=8,
+            periods=8,
+        )
+
+
 def test_half_integers_by_hand():
     twice = hj.experiments.Design.from_lines(
         [[1.5], [1.5]], 0.1, [[0.0], [1.0]], n_sections=8, periods=8

@@ -69,6 +69,13 @@ class Neuron(hj.HybridSystem):
         return hj.Guess("membrane", jnp.atleast_1d(self.low), after="spike")
 
 
+class PushedAtSpikes(Neuron):
+    """The same with an input that acts at spikes alone."""
+
+    def field(self, t, q, u):
+        return super().field(t, q, 0 * u)
+
+
 class Driven(hj.HybridSystem):
     """A clocked cycle whose states are proportional to the force, and differ in size."""
 
@@ -284,8 +291,11 @@ def test_integrate_and_fire_neurons_respond_as_their_closed_forms():
     (impulse,) = leaky.impulses()
     assert_allclose(impulse.weight["u"], 1.5 + 0.25, rtol=1e-12)
     assert "inputs act at spike" in str(leaky)
-    with pytest.raises(hj.errors.DefinitionError, match="acts at events alone"):
+    with pytest.raises(hj.errors.DefinitionError, match="acts at events, too: see"):
         leaky.curve("u")
+    held = hj.find_limit_cycle(PushedAtSpikes(grip=0.3)).responses()
+    with pytest.raises(hj.errors.DefinitionError, match="acts at events alone: see"):
+        held.curve("u")
     # v' = I + v^2: v = tan(t + arctan v0) for I = 1.
     system = Neuron(
         current=1.0,

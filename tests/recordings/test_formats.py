@@ -636,6 +636,58 @@ def test_c3d_that_is_longer_than_its_header_can_say(tmp_path):
     refused("of which only 65535 can be read: export parts", path)
 
 
+def as_dec(numbers: bytes) -> bytes:
+    """Little-endian floating-point numbers of IEEE in the form of DEC: the exponent is larger by 2,
+    and both halves change places."""
+    words = (4 * np.frombuffer(numbers, "<f4")).view("<u2").reshape(-1, 2)
+    return words[:, ::-1].tobytes()
+
+
+def write_as_dec(path):
+    """Rewrite a C3D file in the numbers of DEC."""
+    data = bytearray(path.read_bytes())
+
+    def convert(begin, count):
+        data[begin : begin + 4 * count] = as_dec(data[begin : begin + 4 * count])
+
+    convert(12, 1)  # the scale
+    convert(20, 1)  # the rate
+    begin = 512 * (data[0] - 1)
+    data[begin + 3] = 85
+    place = begin + 4
+    while data[place]:
+        length, group = np.frombuffer(data[place : place + 2], np.int8)
+        place += 2 + abs(int(length))
+        following = place + int.from_bytes(data[place : place + 2], "little")
+        if group > 0 and data[place + 2] == 4:
+            axes = data[place + 3]
+            sizes = data[place + 4 : place + 4 + axes]
+            convert(place + 4 + axes, int(np.prod(sizes)))
+        if following == place:
+            break
+        place = following
+    first = 512 * (int.from_bytes(data[16:18], "little") - 1)
+    convert(first, (len(data) - first) // 4)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("frames", [20, 2**16 - 1])
+def test_c3d_in_the_numbers_of_dec(tmp_path, frames):
+    """The sign of the scale, which gives the size of numbers, is in another byte."""
+    ezc3d = pytest.importorskip("ezc3d")
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [200]
+    file["parameters"]["POINT"]["LABELS"]["value"] = ["M"]
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["data"]["points"] = np.full((4, 1, frames), 1.5)
+    path = tmp_path / "dec.c3d"
+    file.write(str(path))
+    write_as_dec(path)
+    t, x = samples(hj.read_recording(path), "M.x")
+    assert len(t) == frames
+    assert (x == 1.5).all()
+
+
 def test_mcap_with_a_hole(tmp_path):
     """The index counts more messages than the file still has."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")

@@ -1,5 +1,7 @@
 """Cycles modulo a symmetry: the walker in full, with two legs that have names and a place."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -79,6 +81,15 @@ class Full(hj.HybridSystem):  # Nothing is relabeled in the resets.
         return hj.Guess("left stands", state)
 
 
+class OneSided(Full):
+    """Legs land under different conditions."""
+
+    def transitions(self):
+        left, right = super().transitions()
+        yield left
+        yield dataclasses.replace(right, enabled=lambda t, q, u: q[1] > 0)
+
+
 FAR = hj.Output("far", {"left stands": lambda t, q, u: q[4] + q[0]})
 PLACED = type("Placed", (Full,), {"outputs": lambda self: [FAR]})()
 PARTNERS = {"left": "right", "left_rate": "right_rate"}
@@ -114,6 +125,11 @@ def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section
             Full(early=0.1),
             MIRROR,
             "'left lands' is not the mirror image of .* 'right lands'",
+        ),
+        (
+            OneSided(),
+            MIRROR,
+            "`enabled` of transition 'left lands' is not the mirror image",
         ),
     ],
 )
@@ -237,3 +253,30 @@ def test_scheduled_switches_close_after_half_a_period():
         hj.errors.DefinitionError, match="'down' must not be scheduled at t = 0"
     ):
         hj.systems.Symmetric(Inverter(early=0.0), **symmetry)
+
+
+class Shaken(hj.HybridSystem):
+    """A block on a floor that is shaken: its picture moves with the block."""
+
+    def charts(self):
+        return {"slides": FieldChart(self.field, ("x", "v"))}
+
+    def field(self, t, q, u):
+        return q[1] + jnp.cos(2 * jnp.pi * t), -q[1] + jnp.sin(2 * jnp.pi * t)
+
+    def period(self):
+        return 1.0
+
+    def draw(self, chart, t, q):
+        return hj.systems.Drawing({"ground": [(-1.0, 0.0), (1.0, 0.0)]})
+
+
+def test_a_picture_of_half_a_period_moves_by_the_clock_of_its_half():
+    halved = hj.systems.Symmetric(
+        Shaken(), flipped=("x", "v"), translation=("x",), half_period=True
+    )
+    state = {"v": jnp.asarray(0.3), "clock": jnp.asarray(0.1)}
+    for t in (0.1, 0.6):  # the same state in the first and the second half
+        drawing = halved.draw("slides", jnp.asarray(t), state)
+        speed = 0.3 + np.cos(2 * np.pi * 0.1)
+        assert_allclose(drawing.velocity, [speed, 0.0], rtol=1e-12)

@@ -2,7 +2,10 @@
 
 Static type checkers see the plain type in each. A kind that only one function needs is written in
 its signature: `Annotated[float, Number("a number above 1", above=1)]`, `Annotated[Numbers, Reals("N
-d")]`.
+d")]`. A kind for several functions is one more name here. The bounds are those of `limits.py`.
+
+`kind_of` turns an annotation into its kind. If an argument is not checked as its annotation says,
+look there; if a value is refused wrongly, at the kind itself (`values.py`, `containers.py`).
 """
 
 import collections.abc

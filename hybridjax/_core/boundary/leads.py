@@ -4,6 +4,10 @@ meant.
 Such a hint is called a lead here. Users guess with the words of other libraries, or give the result
 of an earlier step. `checked.py`, `members.py` and `public.py` ask for one when they raise an error.
 The tables in `guesses` are read only where an error is raised.
+
+Leads are tried in an order, the certain ones first (`_leads_of_name`, `_leads_of_attribute`,
+`_leads_of_argument`): if a message leads to the wrong thing, look there; if it leads nowhere, add a
+line to a table in `guesses`.
 """
 
 import dataclasses

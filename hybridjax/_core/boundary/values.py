@@ -1,4 +1,15 @@
-"""Kinds of single values and of arrays, and what is wrong with a value that does not fit."""
+"""Kinds of single values and of arrays, and what is wrong with a value that does not fit
+(`Misfit`).
+
+A *kind* describes the values that an argument may have: `Kind.take` returns a value in the form in
+which functions use it, or raises `Misfit`, of which `checked.py` makes an error that names the
+argument. Kinds that are made of other kinds are in `containers.py`, and the names of kinds for
+signatures in `kinds.py`.
+
+A new kind is a subclass with `allowed` (the words after "must be") and `fits`, or `take` if it
+changes the value. If a good value is refused, look at `take` of its kind; if a message describes a
+value badly, at `show`.
+"""
 
 import contextlib
 import dataclasses

@@ -1,5 +1,8 @@
 """The part of `run.py` for Dask: hand pieces of work to the workers of a cluster, and check first
 that the workers would compute the same numbers.
+
+`run_on` is the entry. Results must be the same on all workers: if workers are refused without need,
+look at `_check_packages`. Files are written by the workers or here, never by both for one piece.
 """
 
 import contextlib

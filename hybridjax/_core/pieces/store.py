@@ -1,8 +1,14 @@
-"""Results of many independent points, in memory, or in a Zarr group that any processes fill.
+"""Results of many independent points, in memory (`ArrayStore`), or in a Zarr group that any
+processes fill (`ZarrStore`).
 
-A piece is a block of points. In a group it is a chunk of each variable, which appears complete or
-not at all and holds its own checksum. A piece is present when all its chunks are, so no list of
-finished pieces can be wrong.
+A piece is a block of points (`Blocks`). In a group it is a chunk of each variable, which appears
+complete or not at all and holds its own checksum. A piece is present when all its chunks are, so no
+list of finished pieces can be wrong; this must stay so, as processes may end at any time. Files are
+not trusted: sizes, links and checksums are tested before anything is read.
+
+`run.py` opens a store by `open_store`, or makes it by `make_store`. If the store of an earlier call
+is refused, look at the `description` of the job, which must be equal; if a piece is computed again
+without need, at `missing` and `discard_damaged`.
 """
 
 import contextlib

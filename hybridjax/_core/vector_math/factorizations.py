@@ -12,6 +12,9 @@ left to LAPACK.
 Matrices stand on the last two axes. Where LAPACK would report a failure, results are NaN or
 infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, Matrix Computations,
 4th ed. (2013), sections 3.4 and 4.2.
+
+If a solution is inaccurate, compare with `jnp.linalg` for the same matrix; if a program calls
+LAPACK in spite of these, look at `rewrite.py`.
 """
 
 import functools as ft

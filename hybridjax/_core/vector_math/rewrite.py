@@ -5,6 +5,9 @@ for sin, cos, tan, arctan, arctan2, arcsin and arccos are replaced by those of `
 the factorizations behind `jnp.linalg` by those of `factorizations` (docs/how-to/speed-up.md:
 reasons, accuracy). If a later JAX renames these equations, they are not found and not replaced:
 results are right, and slower.
+
+If a rewritten program gives other results, look at the function that was put in (`trigonometry.py`,
+`factorizations.py`); if it is as slow as before, at the names of equations.
 """
 
 import functools as ft

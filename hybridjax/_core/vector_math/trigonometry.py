@@ -15,6 +15,10 @@ functions that were written with `jnp`.
   as they do in all arithmetic of XLA on CPU.
 
 Each has derivatives of all orders, in forward and reverse mode. Arguments are of float64.
+
+The coefficients and the pieces of pi/2 must not be changed by hand: the accuracy above holds for
+these. If a result is inaccurate, look whether its argument was reduced (|x| < 1.6e6), then at the
+polynomial.
 """
 
 import math

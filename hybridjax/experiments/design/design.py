@@ -2,8 +2,12 @@
 
 `multisine`, `paper_design` and `hj.designs` make designs, and `run_experiments` and `estimate_htf`
 use them. A *line* is the integer j of a frequency j / P in cycles per period, with P the number of
-periods of an experiment. `check` has the rules under which HTFs can be estimated; the arithmetic of
-lines is in `partition.py`.
+periods of an experiment.
+
+`check` has the rules under which HTFs can be estimated, and `_check_...` one rule each: look there
+if a design is refused without need. They follow from the theory and are not settings. The
+arithmetic of lines is in `partition.py`. If signals are wrong, look at `signals`; if their CSV file
+is wrong, at `tables.py`.
 """
 
 from collections.abc import Sequence
@@ -147,9 +151,15 @@ class Design(Showable, eqx.Module):
 
         **Raises:** `DefinitionError` that names the experiment and the frequencies.
         """
-        P = self.periods
-        N = self.n_sections
-        check_window(N, P)
+        check_window(self.n_sections, self.periods)
+        self._check_cosines()
+        self._check_sharing()
+        self._check_together()
+        self._check_phases()
+
+    def _check_cosines(self) -> None:
+        """**Raises:** an error for entries that are out of range, each seen alone, and for
+        experiments that are out of order or have no cosine."""
         for name in ("line", "channel", "amplitude", "phase"):
             shapes = self.experiment.shape, getattr(self, name).shape
             require_equal(f"`experiment` and `{name}`", "shapes", *shapes)
@@ -159,8 +169,14 @@ class Design(Showable, eqx.Module):
             raise DefinitionError(
                 "every experiment needs a frequency: `frequencies` skips some."
             )
+        # (`signals` finds the cosines of a part of the experiments by their places.)
+        if np.any(np.diff(self.experiment) < 0):
+            raise DefinitionError(
+                "`experiment` must ascend: `Design.from_lines` puts cosines in order."
+            )
+        N = self.n_sections
         self._refuse(
-            (self.line < 0) | (2 * self.line > N * P),
+            (self.line < 0) | (2 * self.line > N * self.periods),
             f"lies outside [0, N/2 = {N / 2}]",
         )
         good = np.isfinite(self.amplitude) & (self.amplitude > 0)
@@ -169,15 +185,18 @@ class Design(Showable, eqx.Module):
         nu = len(self.inputs)
         outside = (self.channel < 0) | (self.channel >= nu)
         self._refuse(outside, f"is applied to an input that is not one of the {nu}")
-        # Several inputs may share a line, but none may have it twice.
-        entry = np.stack([self.experiment, self.line, self.channel], axis=1)
-        _, again = np.unique(entry, axis=0, return_counts=True)
-        if (again > 1).any():
-            check_sharing(self.experiment, self.line, P)
-        pair = np.unique(entry[:, :2], axis=0)
-        check_sharing(pair[:, 0], pair[:, 1], P)
-        self._check_together(len(pair))
-        self._check_phases()
+
+    def _check_sharing(self) -> None:
+        """**Raises:** an error for two cosines of one experiment whose responses fall on the same
+        frequencies. Several inputs may share a line, but none may have it twice."""
+        cosine = np.stack([self.experiment, self.line, self.channel], axis=1)
+        _, place, count = np.unique(
+            cosine, axis=0, return_inverse=True, return_counts=True
+        )
+        twice = count[place.ravel()] > 1
+        check_sharing(self.experiment[twice], self.line[twice], self.periods)
+        line = np.unique(cosine[:, :2], axis=0)
+        check_sharing(line[:, 0], line[:, 1], self.periods)
 
     def _check_phases(self) -> None:
         """**Raises:** an error for frequencies on multiples of 1/2 without the phases they need."""
@@ -186,13 +205,14 @@ class Design(Showable, eqx.Module):
         nu = len(self.inputs)
         u = self.amplitude * np.exp(1j * self.phase)
         _, group = np.unique(self.line * nu + self.channel, return_inverse=True)
+        # The sum of the squares has the modulus of the power if all phases are equal modulo pi.
         power = np.bincount(group, np.abs(u) ** 2)
         square = u**2
         re = np.bincount(group, np.real(square))
         im = np.bincount(group, np.imag(square))
-        alike = np.hypot(re, im) / power
+        has_one_phase = np.hypot(re, im) / power > 1 - SINGULAR
         self._refuse(
-            (needs_two_phases(self.line, P, N) & (alike > 1 - SINGULAR)[group]),
+            needs_two_phases(self.line, P, N) & has_one_phase[group],
             "lies on a multiple of 1/2, where one phase does not suffice: excite it in two "
             "experiments with phases 90 degrees apart (multisine(lines='two-phase') does so), or "
             "leave it out",
@@ -202,20 +222,21 @@ class Design(Showable, eqx.Module):
             "is zero at every section with this phase: give it the phase 0",
         )
 
-    def _check_together(self, pairs: int) -> None:
+    def _check_together(self) -> None:
         """**Raises:** an error if responses to several inputs cannot be separated."""
-        if pairs == len(self.line):
+        line_of_experiment = np.stack([self.experiment, self.line], axis=1)
+        if len(np.unique(line_of_experiment, axis=0)) == len(self.line):
             return
-        nu = len(self.inputs)
         lines, place = np.unique(self.line, return_inverse=True)
-        U = np.zeros((len(lines), self.experiments, nu), complex)
+        U = np.zeros((len(lines), self.experiments, len(self.inputs)), complex)
         U[place, self.experiment, self.channel] = self.amplitude * np.exp(
             1j * self.phase
         )
+        inputs_at_once = np.sum(np.abs(U) > 0, axis=2).max(axis=1)
+        together = inputs_at_once > 1
         gram = np.einsum("kei,kej->kij", U.conj(), U)
         self._refuse(
-            ~regular(gram)[place]
-            & (np.sum(np.abs(U) > 0, axis=2).max(axis=1) > 1)[place],
+            (together & ~regular(gram))[place],
             "excites several inputs together, and its experiments cannot tell them apart: excite "
             "it in as many experiments as inputs, with turned phases "
             "(multisine(division='orthogonal'))",
@@ -369,13 +390,14 @@ class Design(Showable, eqx.Module):
     ) -> Float[np.ndarray, "F nu"]:
         """Return the variance of every H_m at `frequencies` for white output noise of this std.
 
-        `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line.
+        `4 noise^2 / (N P repeats sum a^2)`, the sum over all experiments that measure the line;
+        infinite for an input that lacks the line. At f = 0 and N/2, `2 a cos(phase)` stands for a.
         """
         lines, place = np.unique(self.line, return_inverse=True)
         power = np.zeros((len(lines), len(self.inputs)))
-        alone = is_real(self.line, self.periods, self.n_sections)
-        real = np.where(alone, 2 * np.cos(self.phase), 1)
-        np.add.at(power, (place, self.channel), (self.amplitude * real) ** 2)
+        real = is_real(self.line, self.periods, self.n_sections)
+        factor = np.where(real, 2 * np.cos(self.phase), 1)
+        np.add.at(power, (place, self.channel), (self.amplitude * factor) ** 2)
         samples = self.n_sections * self.periods * repeats
         with np.errstate(divide="ignore"):
             return 4 * noise**2 / (samples * power)

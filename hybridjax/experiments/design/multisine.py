@@ -2,7 +2,10 @@
 (`paper_design`).
 
 Both divide the lines of a band among experiments (`partition.py`), give them random phases, and
-return a `Design`. A *line* is the integer j of a frequency j / P in cycles per period.
+return a `Design`. A *line* is the integer j of a frequency j / P in cycles per period. If a
+frequency is missing, look at `_lines`; if the number of experiments is wrong, at `_number`; if
+inputs cannot be told apart, at `_orthogonal`. A further choice of lines or division is a word in
+its type, a case in the function that uses it, and a rule in `_check_choices`.
 """
 
 from collections.abc import Callable

@@ -14,6 +14,9 @@ possible number of experiments, and every greater number works, too.
 
 `assign` makes a random division of lines that obeys this rule, and `avoid_second_order` also avoids
 the frequencies of second-order distortion.
+
+If a good design is refused, look at `line_class` and `check_sharing`; if second-order products are
+left on lines, at `_anneal`, whose rounds are limited.
 """
 
 import itertools

@@ -4,6 +4,9 @@ known input.
 It fits a flat curve, then a smooth one (`estimation.py`), and returns a `PhaseResponse`. The phase
 model that forecasts intervals between events is in `model.py`, and the model of their errors in
 `errors.py`.
+
+If a curve is wrong, look at `estimation.py`; if forecasts are, at `PhaseResponse.forecast`; if
+intervals are lost or counted twice, at `_intervals` and `intervals_of` (`model.py`).
 """
 
 import equinox as eqx

@@ -3,6 +3,10 @@ table (Parquet, Feather, Excel).
 
 `read.py` calls a function `read_...` by the suffix of a file; each returns tables of `Columns`
 (`columns.py`). In files with groups, `_read_tree` decides which array holds the times of a signal.
+
+If a signal has wrong times, look at `_nearest`; if a number is scaled wrongly or not marked as
+missing, at `Leaf.values` (packing and marks of NetCDF); if a matrix is read along the wrong axis,
+at `_columns`.
 """
 
 import csv

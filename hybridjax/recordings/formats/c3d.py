@@ -1,8 +1,13 @@
 """Reader of C3D files: markers, analog channels, events.
 
 `read.py` calls `read_c3d`, which returns two tables of `Columns`: markers and analog channels. The
-bytes are decoded by ezc3d; the header is read here only to refuse files whose number of frames it
-cannot hold.
+bytes are decoded by ezc3d. The header is read here again (`_read_header`), as ezc3d does not report
+files that are truncated, or that have more frames than a header can count. The numbers in
+`_read_header` are those of the file format (c3d.org), not settings.
+
+If a marker is missing or has a wrong unit, look at `_points`; if times are wrong, at `_with_times`
+and at the first frame of the file; if events are wrong, at `_events`; if a file is refused without
+need, at `_read_header` and `_refuse_frames_beyond`.
 """
 
 import itertools
@@ -10,7 +15,7 @@ import struct
 from collections.abc import Mapping
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -26,73 +31,93 @@ Named = list[tuple[str, Float[np.ndarray, " n"]]]
 Rows = Float[np.ndarray, "channels n"]
 
 
+# Numbers are stored in the form of a processor, which the parameters name: Intel, DEC or MIPS. For
+# each: the order of bytes in integers, and the byte of the header with the sign of the scale.
+_PROCESSORS = {84: ("<", 15), 85: ("<", 13), 86: (">", 12)}
+_BLOCK = 512
+
+
 def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     """Read markers as `LABEL.x`, `LABEL.y`, `LABEL.z` and analog channels as `LABEL`, each at its
-    own rate, and events as `CONTEXT LABEL`.
+    own rate, and events as `CONTEXT LABEL`. Rows without a label are left out.
 
-    Times count from the first captured frame, as those of the events do.
+    Times count from the first frame of the capture, as those of events do: a trimmed file begins
+    later than 0.
 
     **Raises:** `FileFormatError` for a damaged or truncated file.
     """
     ezc3d = package("ezc3d")
     with reading(path, "C3D file"):
         file = ezc3d.c3d(str(path))
-        declared = _declared_frames(path)
+        header = _read_header(path)
     data = file["data"]
     frames = data["points"].shape[2]
-    if declared is None:
-        _refuse_frames_beyond(path, frames, data)
-    check_rows(path, frames, declared, "frames")
-    header = file["header"]["points"]
+    if header.frames is None:
+        _refuse_frames_beyond(path, frames, data, header)
+    check_rows(path, frames, header.frames, "frames")
     parameters = file["parameters"]
+    markers = _points(parameters["POINT"], data)
+    channels = _analogs(parameters["ANALOG"], data["analogs"][0])
     tables = []
-    for columns in (
-        _points(parameters["POINT"], data),
-        _analogs(parameters["ANALOG"], data["analogs"][0]),
-    ):
+    for columns in (markers, channels):
         two_columns(path, [name for name, _ in columns])
         if columns:
-            per_frame = len(columns[0][1]) // frames
-            first = header["first_frame"] * per_frame
-            rate = header["frame_rate"] * per_frame
-            time = (np.arange(frames * per_frame) + first) / rate
-            tables.append(Columns({"time (s)": time} | dict(columns)))
+            tables.append(_with_times(columns, frames, file["header"]["points"]))
     if tables:
         events = _events(parameters.get("EVENT", {}))
         tables[0] = tables[0]._replace(events=events)
     return tables
 
 
-def _declared_frames(path: Path) -> int | None:
-    """Return the number of frames that the header states (ezc3d returns a corrected number); None
-    if it needs more than 16 bits."""
+def _with_times(columns: Named, frames: int, points: Mapping[str, Any]) -> Columns:
+    """Return columns of one rate with their times, from the header of the points."""
+    _, first_column = columns[0]
+    per_frame = len(first_column) // frames
+    first = points["first_frame"] * per_frame
+    rate = points["frame_rate"] * per_frame
+    time = (np.arange(frames * per_frame) + first) / rate
+    return Columns({"time (s)": time} | dict(columns))
+
+
+class _Header(NamedTuple):
+    frames: int | None
+    """The number of frames that the header states (ezc3d returns a corrected number); None if it
+    needs more than 16 bits."""
+    first_block: int
+    """The block at which the data begin, counted from 1."""
+    bytes_of_number: int
+    """4 for floating-point numbers, which a negative scale marks, or 2 for integers."""
+
+
+def _read_header(path: Path) -> _Header:
     with open(path, "rb") as file:
-        head = file.read(10)
-        # The type of the processor, in the parameters.
-        file.seek(512 * (head[0] - 1) + 3)
-        order = ">" if file.read(1) == b"\x56" else "<"
-    first, last = struct.unpack(f"{order}HH", head[-4:])
-    return last - first + 1 if last < 2**16 - 1 else None
+        head = file.read(18)
+        first_block_of_parameters = head[0]
+        file.seek(_BLOCK * (first_block_of_parameters - 1) + 3)
+        (processor,) = file.read(1)
+    order, sign = _PROCESSORS.get(processor, _PROCESSORS[84])
+    first, last = struct.unpack(f"{order}HH", head[6:10])
+    (first_block,) = struct.unpack(f"{order}H", head[16:18])
+    return _Header(
+        frames=last - first + 1 if last < 2**16 - 1 else None,
+        first_block=first_block,
+        bytes_of_number=4 if head[sign] & 0x80 else 2,
+    )
 
 
-def _refuse_frames_beyond(path: Path, frames: int, data: Mapping[str, Any]) -> None:
+def _refuse_frames_beyond(
+    path: Path, frames: int, data: Mapping[str, Any], header: _Header
+) -> None:
     """**Raises:** `FileFormatError` if the file is so long that it holds more than these frames.
 
     The header counts frames with 16 bits, and ezc3d reads no more.
     """
-    with open(path, "rb") as file:
-        head = file.read(20)
-        file.seek(512 * (head[0] - 1) + 3)
-        order = ">" if file.read(1) == b"\x56" else "<"
-    (scale,) = struct.unpack(f"{order}f", head[12:16])
-    (first_block,) = struct.unpack(f"{order}H", head[16:18])
     channels, samples = data["analogs"].shape[1:]
-    values = 4 * data["points"].shape[1] + channels * (samples // frames)
-    # Negative scales mark numbers of four bytes.
-    size = values * (4 if scale < 0 else 2)
-    written = (path.stat().st_size - 512 * (first_block - 1)) // size
-    # The last block of 512 bytes is filled up.
-    if written - frames > 512 // size:
+    numbers = 4 * data["points"].shape[1] + channels * (samples // frames)
+    size = numbers * header.bytes_of_number
+    written = (path.stat().st_size - _BLOCK * (header.first_block - 1)) // size
+    # (The last block is filled up.)
+    if written - frames > _BLOCK // size:
         raise FileFormatError(
             f"'{path}' holds about {written} frames, of which only {frames} can be read: export "
             f"parts of at most {2**16 - 1} frames."
@@ -103,7 +128,8 @@ def _points(
     parameters: Mapping[str, Any],
     data: Mapping[str, Any],
 ) -> Named:
-    """Return markers; a negative residual marks a sample at which a marker was not visible."""
+    """Return the coordinates of markers, NaN where a negative residual says that a marker was not
+    visible."""
     residuals = data["meta_points"]["residuals"][0]
     points = np.where(residuals < 0, np.nan, data["points"][:3])
     markers = np.moveaxis(points, 1, 0)

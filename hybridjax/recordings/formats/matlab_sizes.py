@@ -6,6 +6,9 @@ malicious file is refused before memory is taken.
 A file is a list of elements: a tag (type, bytes) and its data. Arrays are elements that begin with
 their flags, sizes and names; members of structs and cells are arrays in them. A compressed element
 holds one array (MAT-File Format, The MathWorks 2020, Ch. 1).
+
+If a good file is refused, look at `_array`, which reads the headers of all members; the numbers
+above are those of the format.
 """
 
 import math

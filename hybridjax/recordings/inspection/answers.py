@@ -5,6 +5,9 @@ was the input exogenous?
 there), `inexact_events` and `feedback`. In this file, an *answer* is the response of the outputs to
 an input within one part of a recording, and its *gain* the ratio of the actual to the predicted
 response.
+
+If an input is reported without need, look at the prediction in `_answers`; if events are, at
+`inexact_events` and `_SHIFTED`. The constants say when a gain is odd.
 """
 
 from collections.abc import Iterator, Sequence

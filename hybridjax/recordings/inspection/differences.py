@@ -1,8 +1,10 @@
-"""Checks that compare trials: units, columns, clocks, cycles; and slow changes.
+"""Checks that compare trials (units, columns, clocks, cycles), and cycles within each trial.
 
-`inspect.py` calls the functions without underscore; each yields findings. Most of them compare a
-number of one trial (range, period, correlation of average cycles) with the median of the other
-trials. The constants are their limits.
+`inspect.py` calls the functions without underscore; each yields findings, whose titles lead to the
+function. Those that compare trials (`other_settings`, `clocks`, `other_cycles`) compare a number of
+one trial (range, period, correlation of average cycles) with the median of the other trials. Those
+that look into each trial are `coarse_stamps`, `odd_cycles`, `alternating_cycles` and
+`slow_changes`. The constants are their limits: change these if a finding is missed or needless.
 """
 
 import itertools
@@ -26,13 +28,15 @@ from ..smoothing import Series
 # it differs from one by less than this factor. Larger: other gains are taken for units. Smaller:
 # swapped columns of signals whose range varies pass.
 _ALIKE = 1.2
-# A trial has another zero if its offset exceeds this multiple of the offsets of other trials, and a
-# part of the range. Larger: offsets pass. Smaller: scatter between trials is reported.
+# A trial has another zero if its offset exceeds this multiple of the offsets of other trials, and
+# the usual range divided by this number. Larger: offsets pass if other trials scatter, and small
+# ones are reported if they do not. Smaller: the reverse.
 _OFF = 10.0
 # Average cycles of two trials (tables of a number of values) are alike if their correlation exceeds
 # this. Larger: noisy cycles are reported as different. Smaller: trials with other events or swapped
 # signals pass.
 _CORRELATED = 0.8
+# Values of an average cycle. More: noisy cycles differ. Fewer: brief features are smeared.
 _PHASES = HARMONICS // 2
 # A trial has another period if the relative difference exceeds this. Larger: other speeds pass.
 # Smaller: jitter is reported.
@@ -40,9 +44,9 @@ _OTHER_PERIOD = 0.02
 # Least number of cycles for which a usual duration is defined. Larger: short trials are not tested.
 # Smaller: chance is reported.
 _STRETCH = 8
-# A cycle is odd if its duration differs from the median by more than this, in medians of such
-# differences, and by a part of the period. Larger: lost samples pass. Smaller: variable rhythms are
-# reported.
+# A cycle is odd if its duration differs from the median by more than `_ODD` medians of such
+# differences, and by more than the part `_ALIKE_PERIODS` of the period. Larger: lost samples pass.
+# Smaller: variable rhythms are reported.
 _ODD = 12.0
 _ALIKE_PERIODS = 0.05
 # Time stamps are coarse if the times between samples are multiples of a *grid* (the resolution of
@@ -71,7 +75,8 @@ def other_settings(
     names: list[str],
     outputs: tuple[str, ...],
 ) -> Iterator[Finding]:
-    """Find trials in which a signal has another unit or zero, or two outputs changed places."""
+    """Find trials in which a signal has another unit or zero, or two outputs changed places. The
+    search ends at the first such pair: its columns make further findings meaningless."""
     if len(recording.trials) < 2:
         return
     levels = [[_levels(x) for _, x in recording.samples(name)] for name in names]
@@ -352,61 +357,76 @@ def _difference(
     name: str,
     outputs: Sequence[str],
 ) -> Iterator[Finding]:
-    """Find the reason why the average cycles of a trial differ from those of other trials."""
-
-    def correlations(x: Cycles) -> Float[np.ndarray, " k"]:
-        squares = (x**2).sum(axis=1) * (usual**2).sum(axis=1)
-        size = np.sqrt(squares)
-        products = (x * usual).sum(axis=1)
-        return products / np.maximum(size, np.finfo(float).tiny)
-
-    alike = correlations(mean)
+    """Find the reason why the average cycles of a trial differ from those of other trials, the
+    first of these: the sign of one output, the direction of time, the start of cycles."""
+    alike = _correlations(mean, usual)
     unlike = np.flatnonzero(alike <= _CORRELATED).tolist()
     if not unlike:
         return
-    backwards = mean[:, ::-1]
-    turned = [correlations(np.roll(backwards, m, axis=1)).min() for m in range(_PHASES)]
-    shifted = [correlations(np.roll(mean, m, axis=1)).min() for m in range(_PHASES)]
+    turned = _least_by_shift(mean[:, ::-1], usual)
+    shifted = _least_by_shift(mean, usual)
+    best = int(np.argmax(shifted))
     runs_backwards = max(turned) > _CORRELATED and max(turned) > max(shifted)
     if len(unlike) == 1 and alike[unlike[0]] < -_CORRELATED:
-        remedy = "turn it."
-        if runs_backwards:
-            remedy = (
-                "turn it; or the trial runs backwards: then reverse all of its signals."
-            )
-        yield Finding(
-            "another sign",
-            f"{outputs[unlike[0]]} has the other sign in trial '{name}': {remedy}",
-            "refused",
-        )
-        return
-    if runs_backwards:
-        exchanged = [
-            f"{outputs[i]} and {outputs[j]}"
-            for i, j in combinations(range(len(outputs)), 2)
-            if correlations(_with_exchanged(mean, i, j)).min() > _CORRELATED
-        ]
-        or_exchanged = f"; or {exchanged[0]} have changed places" if exchanged else ""
-        yield Finding(
-            "backwards",
-            f"cycles of trial '{name}' are those of the others in reverse, as if it ran backwards: "
-            f"reverse all of its signals, or leave it out{or_exchanged}.",
-            "refused",
-        )
-        return
-    best = int(np.argmax(shifted))
-    if best and shifted[best] > _CORRELATED:
+        yield _other_sign(outputs[unlike[0]], name, runs_backwards)
+    elif runs_backwards:
+        yield _backwards(mean, usual, name, outputs)
+    elif best and shifted[best] > _CORRELATED:
         away = min(best, _PHASES - best) / _PHASES
         yield Finding(
             "another event",
             f"cycles of trial '{name}' begin {away:.2g} of a cycle away from the others.",
             "refused",
         )
-        return
-    which = ", ".join(outputs[k] for k in unlike)
-    yield Finding(
-        "another cycle",
-        f"the average cycle of {which} in trial '{name}' is not that of the others.",
+    else:
+        which = ", ".join(outputs[k] for k in unlike)
+        yield Finding(
+            "another cycle",
+            f"the average cycle of {which} in trial '{name}' is not that of the others.",
+        )
+
+
+def _correlations(x: Cycles, usual: Cycles) -> Float[np.ndarray, " k"]:
+    """Return the correlation of each output with the usual cycle."""
+    squares = (x**2).sum(axis=1) * (usual**2).sum(axis=1)
+    size = np.sqrt(squares)
+    products = (x * usual).sum(axis=1)
+    return products / np.maximum(size, np.finfo(float).tiny)
+
+
+def _least_by_shift(x: Cycles, usual: Cycles) -> list[float]:
+    """Return the least correlation of all outputs, for cycles that begin at each phase."""
+    shifts = range(_PHASES)
+    return [_correlations(np.roll(x, m, axis=1), usual).min() for m in shifts]
+
+
+def _other_sign(output: str, name: str, runs_backwards: bool) -> Finding:
+    remedy = "turn it."
+    if runs_backwards:
+        remedy = (
+            "turn it; or the trial runs backwards: then reverse all of its signals."
+        )
+    return Finding(
+        "another sign",
+        f"{output} has the other sign in trial '{name}': {remedy}",
+        "refused",
+    )
+
+
+def _backwards(
+    mean: Cycles, usual: Cycles, name: str, outputs: Sequence[str]
+) -> Finding:
+    exchanged = [
+        f"{outputs[i]} and {outputs[j]}"
+        for i, j in combinations(range(len(outputs)), 2)
+        if _correlations(_with_exchanged(mean, i, j), usual).min() > _CORRELATED
+    ]
+    or_exchanged = f"; or {exchanged[0]} have changed places" if exchanged else ""
+    return Finding(
+        "backwards",
+        f"cycles of trial '{name}' are those of the others in reverse, as if it ran backwards: "
+        f"reverse all of its signals, or leave it out{or_exchanged}.",
+        "refused",
     )
 
 

@@ -1,7 +1,9 @@
 """Find samples that were not measured: placeholders, frozen, clipped and wrapped signals, copies.
 
-`inspect.py` calls the functions without underscore. Some return masks of samples, which are then
-left out; the others yield findings. The constants are their limits.
+`inspect.py` calls the functions without underscore. `placeholders`, `frozen` and `repeated_rows`
+return masks of samples, which are then left out; the others yield findings. The constants are their
+limits: if good samples are left out, or a failure passes, look at those of the function whose title
+the finding has.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -13,6 +13,9 @@ Human Brain Mapping 15, 2002). The draws are
   group;
 - subjects with replacement, where values are skewed: the studentized bootstrap (Hall, *The
   Bootstrap and Edgeworth Expansion*, 1992), whose bands are wider.
+
+If a band is too narrow or a p-value too small, look at `_largest` and the weights of the draws
+(`flips`, `_rotations`, `_resampled`); if the wrong kind of draws is used, at `_are_skewed`.
 """
 
 import dataclasses

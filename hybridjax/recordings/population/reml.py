@@ -12,6 +12,9 @@ models of other libraries estimate one variance of all errors instead.
 `population.py` calls `mixed` (several groups or conditions) or `meta` (one estimate for each
 subject), and gets a `Mixed`, whose `contrast` gives differences. `moderated` first reduces the
 scatter of variances from few blocks.
+
+If a mean is wrong, look at `mixed` or `meta`; if its error or degrees of freedom are, at
+`Mixed.contrast`; if the spread between subjects is, at `spread_interval`.
 """
 
 from typing import Any, NamedTuple

@@ -1,6 +1,9 @@
 """Attribute names of other libraries that a class here does not have, each with what to use.
 
 Tables for `leads.py`.
+
+A table has for each class the advice, and the words that lead to it. If a message gives the wrong
+advice for a word, move the word; `sentences.py` has advice that several tables share.
 """
 
 from .sentences import (

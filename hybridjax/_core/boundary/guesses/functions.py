@@ -1,6 +1,9 @@
 """Function names of other libraries that a namespace here does not have, each with the name to use.
 
 Tables for `leads.py`.
+
+A table has for each namespace the advice, and the words that lead to it. If a message gives the
+wrong advice for a word, move the word; `sentences.py` has advice that several tables share.
 """
 
 from .sentences import (

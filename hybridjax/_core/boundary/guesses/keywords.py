@@ -2,6 +2,9 @@
 and what an argument is that a call left out.
 
 Tables for `leads.py`.
+
+A table has for each function ("" for all) the advice, and the words that lead to it. If a message
+gives the wrong advice for a word, move the word.
 """
 
 from .sentences import AT_TIMES, CONTROL, HELD_OUT

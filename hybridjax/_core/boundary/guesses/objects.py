@@ -2,6 +2,9 @@
 the step that leads there from the one it was given.
 
 Tables for `leads.py`.
+
+`MAKERS` has for each class how to make one. If a message gives the wrong advice, change its line
+here.
 """
 
 from .sentences import AT_TIMES

@@ -1,4 +1,8 @@
-"""Words of other libraries for the same thing."""
+"""Words of other libraries for the same thing, each with words of this package.
+
+A table for `words.py`, by which `leads.py` finds the argument or attribute that was meant. If a
+message proposes a wrong name for a word, change the line of the word here.
+"""
 
 WORDS = {
     "A": ("amplitude",),
