@@ -310,7 +310,9 @@ def known(case: Case, branch: Branch) -> list[str]:
         if kinds != [kind for kind, _ in case.marks]:
             found.append(f"marked points {kinds}, not {case.marks}")
         else:
-            for point, (kind, value) in zip(branch.bifurcations, case.marks, strict=True):
+            for point, (kind, value) in zip(
+                branch.bifurcations, case.marks, strict=True
+            ):
                 if abs(point.value - value) > case.within * abs(value):
                     found.append(f"{kind} at {point.value:.10g}, not {value:.10g}")
     if case.exact is not None:
