@@ -62,6 +62,14 @@ NAMES = {
         "use `model.htf(frequencies)`, of `model = hj.linearize(cycle, sections)`, or of a fit": (
             "freqresp frequency_response tf transfer_function htf transfer"
         ),
+        "`hj.ClockPhase(n)` is a family of n sections, and `hj.Crossing('y', 'falling')` a single "
+        "one": (
+            "clock_sections sections section poincare_section poincare_sections clock "
+            "kinematic_sections event_sections surface_of_section"
+        ),
+        "`hj.identify_recording(recording, sections, outputs=names)` needs no inputs": (
+            "identify_unperturbed unperturbed identify_natural variability"
+        ),
         "use `hj.identify_recording(recording, ...)`": (
             "identify_subject identify_trial identify_gait analyze analyse analysis gait "
             "gait_stability"
