@@ -224,7 +224,7 @@ rec.ch_names                                            -> `signals`
 rec.sfreq                                               -> `rate`
 rec.truncate(before=10)                                  -> recording.crop(start, stop)
 hj.identify_recording(rec, apex, tmin=10)                -> recording.crop(start, stop)
-rec.crop(tmin=10)                                       -> `start`
+rec.crop(tmin=10)                                       -> crop(start, stop)
 hj.clock_sections(cycle, 8)                             -> hj.ClockPhase(n)
 hj.identify_unperturbed(rec, apex)                      -> needs no inputs
 rec.pick("yM")                                          -> recording[name]

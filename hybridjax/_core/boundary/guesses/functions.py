@@ -63,10 +63,7 @@ NAMES = {
             "freqresp frequency_response tf transfer_function htf transfer"
         ),
         "`hj.ClockPhase(n)` is a family of n sections, and `hj.Crossing('y', 'falling')` a single "
-        "one": (
-            "clock_sections sections section poincare_section poincare_sections clock "
-            "kinematic_sections event_sections surface_of_section"
-        ),
+        "one": ("clock_sections section clock kinematic_sections event_sections"),
         "`hj.identify_recording(recording, sections, outputs=names)` needs no inputs": (
             "identify_unperturbed unperturbed identify_natural variability"
         ),

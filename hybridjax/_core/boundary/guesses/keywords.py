@@ -23,7 +23,7 @@ KEYWORDS = {
         "`jax.grad` and `jax.jacfwd` differentiate, and need no options": (
             "adjoint jac jacobian gradient vectorized jac_sparsity"
         ),
-        "all of it is used: `recording.crop(start, stop)` is a part of a recording": (
+        "`recording.crop(start, stop)` is a part of a recording; of it, all cycles are used": (
             "tmin tmax crop max_cycles n_strides strides first_cycle last_cycle"
         ),
         "`hj.scale.enable_progress()` shows the progress": (
@@ -38,7 +38,6 @@ KEYWORDS = {
             "seed random_state rng key random_seed"
         ),
     },
-    "crop": {"use `start` and `stop`": "tmin tmax t0 t1 begin end first last"},
     "bode": {
         "`unit='Hz'` with `period=cycle` draws frequencies in Hz": "hz rad",
         "`log=True` draws decibels over a logarithmic axis": "db decibel logscale",
