@@ -198,7 +198,8 @@ def test_blow_up():
 def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, first):
     system = Toys(turning, [low, high])
     start = (0.0, -1.0, 0.0)
-    found = hj.simulate(system, "turn", start, 2 * np.pi)
+    turn = 2 * np.pi
+    found = hj.simulate(system, "turn", start, turn)
     names = [e.name for e in found.events if e.name != "gated"]
     assert names[0] == first
     assert sorted(names) == ["high", "low"]
@@ -219,18 +220,24 @@ def test_events_come_in_order_of_time_and_ties_in_order_of_listing(low, high, fi
     k=st.sampled_from([1.0, 5.0, 20.0]),
 )
 def test_close_crossings_of_different_shape(gap, sign, k):
-    system = Toys(close, [sign * gap, k])
+    distance = sign * gap
+    system = Toys(close, [distance, k])
     start = (0.0, -1.0)
-    found = hj.simulate(system, "turn", start, 2 * np.pi)
-    plain = np.pi / 2 + np.arccos(0.5)
-    angle = np.arccos(0.5 + sign * gap)
-    curved = np.pi / 2 + angle
+    turn = 2 * np.pi
+    found = hj.simulate(system, "turn", start, turn)
+    quarter = np.pi / 2
+    plain = quarter + np.arccos(0.5)
+    curved = quarter + np.arccos(0.5 + distance)
     assert_allclose(times(found, "plain"), [plain], atol=1e-11)
     assert_allclose(times(found, "curved"), [curved], atol=1e-11)
-    if gap > 1e-11:  # otherwise they are at the same instant, up to rounding
-        names = [event.name for event in found.events]
-        in_order = ["plain", "curved"] if plain < curved else ["curved", "plain"]
-        assert names == in_order
+    if gap <= 1e-11:  # they are at the same instant, up to rounding
+        return
+    names = [event.name for event in found.events]
+    if plain < curved:
+        in_order = ["plain", "curved"]
+    else:
+        in_order = ["curved", "plain"]
+    assert names == in_order
 
 
 def tick_reset(t, q, u):

@@ -97,19 +97,26 @@ def test_random_systems_unknown_starts_and_gaps(shape, seed, first):
 
 def test_inputs_before_the_start_act_through_all_lags():
     """A register of one cycle beside a multiplier of 0.7; records begin in any section."""
-    decay = np.diag([0.7**0.25, 0, 0, 0, 0])
+    of_a_section = 0.7**0.25
+    decay = np.diag([of_a_section, 0, 0, 0, 0])
     chain = np.diag([0.0, 1, 1, 1], -1)
     A = decay + chain
     B = np.array([[1.0], [1], [0], [0], [0]])
     C = np.array([[1.0, 0, 0, 0, 1]])
-    blocks = [[x] * 4 for x in (A, B, C, np.zeros((1, 1)))]
+    D = np.zeros((1, 1))
+    blocks = [[x] * 4 for x in (A, B, C, D)]
     model = hj.linear.LDTP.from_blocks(*blocks)
-    data = [record(model, 240, k, first_section=k, x0=np.ones(5)) for k in range(1, 4)]
-    rough = total_least_squares(late_outputs(problem_of(data, 1, 4), 1))
+
+    begin = np.ones(5)
+    data = [record(model, 240, seed=k, first_section=k, x0=begin) for k in range(1, 4)]
+    problem = problem_of(data, 1, 4)
+    rough = total_least_squares(late_outputs(problem, 1))
+    np.testing.assert_allclose(rough, -0.7, atol=1e-9)
     fit = hj.fit_series(data, 1)
-    np.testing.assert_allclose([rough, fit.coefficients], -0.7, atol=1e-9)
-    assert (found := hj.validate(fit, data)).white
-    assert found.fit.min() > 99.999
+    np.testing.assert_allclose(fit.coefficients, -0.7, atol=1e-9)
+    validation = hj.validate(fit, data)
+    assert validation.white
+    assert validation.fit.min() > 99.999
 
 
 def test_outputs_that_depend_on_later_inputs(small):

@@ -132,7 +132,8 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
     given = float(getattr(juggling.system, parameter))
     limits = np.sort([given, given * factor])
     branch = hj.continuation(juggling, parameter, limits, step=step)
-    for end in (branch[0], branch[len(branch) - 1]):
+    last = len(branch) - 1
+    for end in (branch[0], branch[last]):
         a = float(end.system.restitution)
         g = float(end.system.g)
         T = float(end.system.T)

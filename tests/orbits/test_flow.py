@@ -798,15 +798,22 @@ def counters(n):
 def test_each_of_several_events_that_coincide_happens_once(n):
     """None is due again after the others, also where a flow ends right after them."""
     start = hj.Guess("main", jnp.zeros(n + 1))
-    for end in (dict(until=1.0), dict(events=n, within=1.0)):
+    once_each = [*range(n), -1]
+    at_a_time = dict(until=1.0)
+    at_the_last = dict(events=n, within=1.0)
+    for end in (at_a_time, at_the_last):
         found = hj.flow(counters(n), start, **end)
         indices = found.event_index[: n + 1].tolist()
-        assert indices == [*range(n), -1]
+        assert indices == once_each
         assert_allclose(found.state[:n], 0.5, rtol=1e-12)
-    program = jax.jit(lambda x: hj.flow(counters(n), hj.Guess("main", x), 1.0))
+
+    @jax.jit
+    def program(state):
+        return hj.flow(counters(n), hj.Guess("main", state), 1.0)
+
     found = program(start.state)
-    later_indices = found.event_index[: n + 1].tolist()
-    assert later_indices == [*range(n), -1]
+    indices = found.event_index[: n + 1].tolist()
+    assert indices == once_each
     assert found.result == Result.SIMULTANEOUS
 
 

@@ -252,19 +252,26 @@ def test_fits_are_drawn_beside_htfs_and_alone(hopper, estimate, structured):
     noisy = hj.experiments.add_noise(data, snr=60)
     series = hj.fit_series(noisy, order=2, check=False)
     upper = hj.plot.bode(series).axes[0, 0]
-    drawn = labeled(upper)["yM"]
-    f, size = drawn.get_xydata().T
-    assert (f[0], f[-1]) == (0, hopper.n_sections / 2)
-    assert_allclose(size, abs(series.htf(f, 0).H[0, :, 0, 0]), rtol=1e-9)
+    line = labeled(upper)["yM"]
+    f, size = line.get_xydata().T
+    half = hopper.n_sections / 2
+    assert f[0] == 0
+    assert f[-1] == half
+    response = series.htf(f, 0)
+    assert_allclose(size, abs(response.H[0, :, 0, 0]), rtol=1e-9)
     assert upper.collections, "a band"
+    magnitudes = hj.plot.htf(series).ax
+    line = magnitudes.get_lines()[0]
+    assert_allclose(line.get_xydata().T, [f, size], rtol=1e-9)
+
     families = {"model": hopper, "fit": series, "both": [estimate, series]}
     upper = hj.plot.bode(families).axes[0]
     titles = [panel.get_title() for panel in upper]
     assert titles == ["model", "fit", "both"]
-    drawn = [x for x in upper[2].get_lines() if len(x.get_xdata())]
-    assert sum(x.get_color() == "black" for x in drawn) == 2
-    drawn = hj.plot.htf(series).ax.get_lines()[0]
-    assert_allclose(drawn.get_xydata().T, [f, size], rtol=1e-9)
+    both = upper[2]
+    drawn = [x for x in both.get_lines() if len(x.get_xdata())]
+    black = [x for x in drawn if x.get_color() == "black"]
+    assert len(black) == 2
     for draw in (hj.plot.bode, hj.plot.htf):
         with pytest.raises(hj.errors.DefinitionError, match="band of its data"):
             draw(structured)

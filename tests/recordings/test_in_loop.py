@@ -36,25 +36,37 @@ def recording():
     rng = np.random.default_rng(1)
     n = 310 * RATE
     h = 1 / RATE
-    r, w = (hj.experiments.random_input(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2))
+    command, unknown = (
+        hj.experiments.random_input(311, RATE, 8.0, seed=s)[:n, 0] for s in (1, 2)
+    )
     sizes = np.array([0.002, 0.01])[:, None]
-    e = sizes * rng.normal(size=(2, n))
-    x = np.zeros(2)
+    noise = sizes * rng.normal(size=(2, n))
+    state = np.zeros(2)
     y = np.zeros((2, n))
     u = np.zeros(n)
     for i in range(n):
-        y[:, i] = x + e[:, i]
-        u[i] = r[i] - 4 * y[0, i] - y[1, i]
-        for t in (i * h, i * h + h / 2):  # two steps of the midpoint rule
-            force = u[i] + 0.2 * w[i]
-            slope = field(t, x, force)
-            middle = x + h / 4 * slope
-            half_later = t + h / 4
-            x = x + h / 2 * field(half_later, middle, u[i] + 0.2 * w[i])
+        y[:, i] = state + noise[:, i]
+        x, v = y[:, i]
+        u[i] = command[i] - 4 * x - v
+        force = u[i] + 0.2 * unknown[i]
+        begin = i * h
+        for t in (begin, begin + h / 2):  # two steps of the midpoint rule
+            slope = field(t, state, force)
+            middle = state + h / 4 * slope
+            later = t + h / 4
+            state = state + h / 2 * field(later, middle, force)
     t = np.arange(n) * h
     clock = np.cos(2 * np.pi * t)
-    signals = {"time": t, "clock": clock, "u": u, "r": r, "x": y[0] + clock, "v": y[1]}
-    return {name: signal[t >= 10] for name, signal in signals.items()}
+    signals = {
+        "time": t,
+        "clock": clock,
+        "u": u,
+        "r": command,
+        "x": y[0] + clock,
+        "v": y[1],
+    }
+    is_settled = t >= 10
+    return {name: signal[is_settled] for name, signal in signals.items()}
 
 
 @pytest.mark.slow
