@@ -8,7 +8,8 @@ files come from anywhere.
 `hj.save` and `hj.load` call `write_module` and `read_module`. `taken_apart` and `put_together` are
 inverse to each other: a change of one needs one of the other, and `_VERSION` one more if old files
 can no longer be read. If a result cannot be saved, compare its fields with their annotations
-(`_matches`); if a good file is refused, look at `_read_header`, `_check_sizes` and `_array`.
+(`_matches`). If a good file is refused, look at `_read_header`, `_check_sizes` and `_array`; if its
+content is, at `put_together`, or at the constructor of the result.
 """
 
 import dataclasses

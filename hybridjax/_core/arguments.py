@@ -2,9 +2,8 @@
 objects belong to the same system.
 
 Called by public functions whose arguments depend on each other (an index and a count, names and the
-system that has them). Each function is alone, and raises the sentence that a user reads: if this is
-wrong, look at the function; if a name is not suggested, at `spelling.py`. Types of single arguments
-are checked earlier, in `boundary/`.
+system that has them). Each function raises the sentence that a user reads. If a name is not
+suggested, look at `spelling.py`. Types of single arguments are checked earlier, in `boundary/`.
 """
 
 import importlib

@@ -10,9 +10,10 @@ There is no other switch between the two than the type of the arrays. `namespace
 library that belongs to an array, and the functions here do whatever NumPy and JAX write
 differently.
 
-If values on the host and in programs differ, look for a function of NumPy or JAX that `namespace`
-does not cover, and add it here. If a program is traced where values were expected, look at
-`is_traced` and `is_hidden`.
+If values on the host and in programs differ, look in the code that was run for a function that
+NumPy and JAX call alike and compute differently (as `svd` of NaN): it needs a function of its own
+here, as `svdvals`. If a program is traced where values were expected, look at `is_traced` and
+`is_hidden`.
 """
 
 import contextlib

@@ -3,11 +3,11 @@
 A function of `by_columns` is compiled by JAX, but has a rule for its derivatives: outside of
 programs and for few numbers, `along` computes them on the host, which needs no compilation of the
 derivative. Inside of programs, and where `along` raises `NotOnHostError`, JAX derives the compiled
-function. Both must give the same numbers: compare them first if a derivative is wrong.
-`only_on_host` turns the second way into an error, for callers that would rather do without.
+function. Both must give the same numbers: compare them first if a derivative is wrong. Below
+`only_on_host`, a caller that would rather do without gets the `NotOnHostError` instead.
 
 If a derivative is compiled without need, look at the conditions in `rule`: hidden values, or more
-than `most` numbers that move.
+than `most` numbers that move. The third cause is a `NotOnHostError` of `along`.
 """
 
 import contextlib

@@ -1,9 +1,9 @@
 """What objects print: numbers with units, arrays by shape and range, modules by their fields.
 
-Most `__repr__` of the package call these functions, each of which is alone. The constants set how
-much is shown, and tests compare printed texts. If a number has too many or too few digits, look at
-`rounded`, `standard_error` and `number`; if lines break badly, at `folded`; if a field is shown
-badly, at `value` and `_array`.
+Most `__repr__` of the package call these functions. The constants set how much is shown, and tests
+compare printed texts. If a number has too many or too few digits, look at `rounded`,
+`standard_error` and `number`; if lines break badly, at `folded`; if a field is shown badly, at
+`value` and `_array`.
 """
 
 import dataclasses

@@ -1,7 +1,14 @@
 """Files and folders that appear complete or not at all, and folders of results.
 
-A folder of results has a list `.hybridjax-KIND.json` with the names of all results.
-Only a file that is on the list may be replaced or removed.
+Archives, figures and tables call `replacing` for single files, which replaces whatever file has the
+name. Commands and reports call `results_folder`. A folder of results has a list
+`.hybridjax-KIND.json` with the names of all results. Only a file that is on the list may be
+replaced or removed there, and nothing is written through a link: users keep files of their own in
+these folders. The order in `_put` must stay: the list has a file before it is moved into the
+folder, and until it is removed, so that the next call can go on after an interruption.
+
+If a folder is refused without need, look at `_refuse_others` and `_is_direct`; if results of an
+earlier call are left, at the list (`_listed`, `_put`); if a name is refused, at `_refuse_link`.
 """
 
 import contextlib

@@ -2,8 +2,10 @@
 
 Ankarali & Cowan, Sec. VI. `hybridjax reproduce --out DIR` runs this.
 
-`_reproduce` takes the stages in order. The numbers of `Protocol` are the paper's. If a result
-differs from the paper, call the functions of its stage one by one; figures are those of `plot`.
+`_reproduce` takes the stages in order, and `_identify` those for one family of sections. The
+defaults of `Protocol` and the numbers in `_identify` are the paper's, and must stay. If a result
+differs from the paper, compare the fields of a `Family`: where `exact` and `rational_exact` differ,
+too, the cause lies in the cycle or the sections, otherwise in the experiments or the fits.
 """
 
 import dataclasses

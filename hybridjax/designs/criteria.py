@@ -1,12 +1,13 @@
 """The criterion of each goal: which variance does a design minimize?
 
 `optimize.py` calls `criterion_of` with a goal (multipliers, parameters, responses) and models, and
-gets a `Criterion` (`criterion.py`). Each goal has a function here that computes the derivatives of
-measurements by the unknowns (`Channel`), and those of the wanted quantities. A further kind of goal
-is added in `criterion_of`.
+gets a `Criterion` (`criterion.py`). Each goal has a function, here or in `matrices.py`, that
+computes the derivatives of measurements by the unknowns (`Channel`), and those of the wanted
+quantities. A further kind of goal is added in `criterion_of`.
 
-If the criterion of a goal is wrong, compare `_channels` with differences of the HTFs, then the
-derivatives of the wanted quantities.
+If the criterion of multipliers is wrong, compare `_channels` and `wanted_parts` with differences of
+the HTFs and of the multipliers. Parameters have their derivatives from `fitting/fit.py`
+(`identifiability`); responses, and multipliers of `fit_ldtp`, from `matrices.py`.
 """
 
 import dataclasses

@@ -3,8 +3,8 @@
 `Settings` is the public class that users give to `simulate` and `find_limit_cycle`; `filled` puts a
 default accuracy in. In each step, `search/attempt.py` asks `tolerance` for the error that the step
 may have, in units of the states' magnitudes (`size`). The default accuracies may be changed here
-only; results and times of all tests depend on them. If steps are too short in one state, look at
-`size` and `tolerance`: the magnitude of the state is too small.
+only; results and times of all tests depend on them. If steps are too short or too long, look at
+`tolerance` and at the magnitudes of the states (`size`), relative to which errors are judged.
 """
 
 import functools as ft

@@ -10,9 +10,10 @@ Times and events are counted within one turn: only so is every turn computed ali
 compiles one move for all sections. Tests and error estimates have no derivatives (`fixed`,
 `stop_gradient`).
 
-If outputs belong to the wrong side of an input, look at the order in `_Moves.to_next_section`. If
-an experiment fails without need, look at `_Moves.tested` (events in another order) or at the
-search. If `error` is wrong, look at `_largest_error`, and at `weight` in `plan.py`.
+If an output answers an input one section too early or too late, look at the order in
+`_Moves.to_next_section`. If an experiment fails without need, look at `_Moves.tested` (events in
+another order) or at the search. If `error` is wrong, look at `_largest_error`, and at `weight` in
+`plan.py`.
 """
 
 import dataclasses

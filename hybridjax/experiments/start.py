@@ -2,8 +2,12 @@
 
 `Campaign._starts` (`run.py`) calls `periodic_start` (the response that the linear model predicts)
 or `steady_start` (the true periodic response, by Newton's method with the Jacobian of the linear
-model). Both return times and states on section 0. If a transient is left in data, look at
-`steady_start`.
+model). Both return times and states on section 0. Only the number of Newton steps depends on the
+linear model: whether a start is periodic is decided by the `flow` of the experiments themselves,
+and this must stay so.
+
+`periodic_start` leaves a transient of second order in the inputs. If `steady_start` leaves one,
+look at its last step and at `_LAST`; if it finds no start although inputs are small, at `gain`.
 """
 
 from collections.abc import Callable
@@ -88,8 +92,9 @@ def steady_start(
     # Newton's step is the defect plus `gain` times the defect.
     of_sections = np.linalg.solve(np.eye(d) - power, power)
     gain = embed[:, :d] @ of_sections @ back[:d]
-    moves = np.ones((len(gain), 1))
-    moves[0] = to_host(placed).time_is_state[0]
+    # Row 0 is the time. Where it is no state of the section, it stays.
+    is_unknown = np.ones((len(gain), 1))
+    is_unknown[0] = to_host(placed).time_is_state[0]
     change = np.full(start.shape[1], np.inf)
     start = start.copy()
     for _ in range(MOST_STEPS):
@@ -97,7 +102,7 @@ def steady_start(
         if len(rows) == 0:
             break
         end = flow(start[:, rows], rows)
-        defect = (end - start[:, rows]) * moves
+        defect = (end - start[:, rows]) * is_unknown
         step = defect + gain @ defect
         change[rows] = np.max(np.abs(step) / scale, axis=0)
         settled = (change <= _LAST * stepping.accuracy).all()

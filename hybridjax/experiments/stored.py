@@ -6,8 +6,9 @@ them run together, and where the records go. `ExperimentJob` is what the general
 (`_core/pieces/`) asks for: the description of the experiments, and the records of each chunk.
 
 A further option that changes records must be in `ExperimentJob.description`: otherwise a store with
-other records is continued. If a store is refused without need, look there, and at `arrays`; if
-records are wrong, at `run.py`.
+other records is continued. If a store is refused without need, look there. If processes write
+different records, look at `arrays`: all that is computed before the first experiment must be in it.
+If the records of all of them are wrong, look at `run.py`.
 """
 
 import dataclasses

@@ -5,8 +5,8 @@ Each of these is an HTF from one set of signals to another, with an external ref
 instrument; it is estimated by `instrument.solve` from the same sums. `Loop.missing` says which of
 them the data do not give.
 
-If the plant is wrong and the closed loop is right, look at `instrument.py`; if HTFs are missing, at
-`_require_references`.
+If an HTF is wrong, look at its signals and its reference in `estimate_loop`, and at `_without`,
+which takes out the other references; if all are wrong, at `instrument.py`.
 """
 
 from collections.abc import Sequence

@@ -8,7 +8,8 @@ f + b become components of the output at f + a by $H(f)[a, b] = H_{a-b}(f + b)$,
 
 `LDTP` and `HTF` call these functions. If a connection of systems is wrong, look at `connect`; if
 that of HTFs is, at `Lines` (which line stands where), then at the operation; if only variances are,
-at the pairs (G, H) that the operation returns.
+at the pairs (G, H) that the operation returns. `feedback` is negative, $u = r - F y$, as in all
+callers. A further operation on HTFs is a function like `series` (see `Operation`).
 """
 
 from collections.abc import Callable
@@ -51,7 +52,8 @@ def static_gain(
     xp = namespace(gain)
     N = n_sections
     ny, nu = shape
-    one = {"inputs": ny, "outputs": nu}  # of the plant that it controls
+    # (The axes have the names of the signals of the plant: its outputs, ny, are inputs of a gain.)
+    one = {"inputs": ny, "outputs": nu}
     require_axes("a gain", gain, one, {"sections": N} | one)
     return Matrices(
         A=xp.zeros((N, 0, 0)),
@@ -134,9 +136,10 @@ class Lines(NamedTuple):
     """Where the entries of harmonic matrices lie in HTFs: of K classes, each with N lines."""
 
     row: Int[np.ndarray, "K N"]
-    """The line of an HTF that holds component b,"""
+    """For each class and component b, the index of a frequency of the HTF."""
     mirrored: Bool[np.ndarray, "K N"]
-    """by the conjugate of its mirror image if true."""
+    """True if this frequency is minus that of the component: then the conjugate of the HTF there is
+    taken."""
 
     @classmethod
     def of(cls, f: Float[np.ndarray, " F"], N: int) -> "Lines":
@@ -199,7 +202,7 @@ def _centered(f: Float[np.ndarray, "*shape"], N: int) -> Float[np.ndarray, "*sha
 
 Operation = Callable[..., tuple[Array, list[tuple]]]
 """Takes matrices X, and returns the result Y with pairs (G, H), one for each X: to first order
-dY is the sum of the G dX H."""
+dY is the sum of the G dX H, up to signs, which variances do not need. None is an identity."""
 
 
 def series(P, Q):

@@ -5,8 +5,9 @@ from `_states`: a sum over one period, and a linear system for the state at its 
 derivatives must come from the host, `_along` computes them by the same functions.
 `check_harmonics` says which harmonics exist, also for other files.
 
-If H is wrong at all harmonics, look at `_states`; if only its derivatives are, at `_along`. If H_m
-and H_-m are exchanged, the order is that of the FFT: harmonic m is at index m mod N.
+If H is wrong at all harmonics, look at `_states`; if only derivatives that come from the host are,
+at `_along`. If H_m and H_-m are exchanged, look at the index: harmonic m is at m mod N, the order
+of the FFT.
 """
 
 import functools as ft

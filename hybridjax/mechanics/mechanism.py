@@ -11,7 +11,8 @@ symbol is formed: h is one derivative along v of the momentum dT/dv, less one gr
 
 Fields of models call the methods of `Mechanism`, each for one state. Signs are a contract with
 them: forces and impulses act on the mechanism. If a motion is wrong, test `mass` and `bias` first,
-as all other methods use them: without forces, `energy` stays constant.
+from which accelerations follow: without forces, `energy` stays constant. If an impact is wrong,
+look at `contact`, whose derivative it uses, then at `mass`.
 """
 
 from collections.abc import Callable, Mapping

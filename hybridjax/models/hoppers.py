@@ -2,8 +2,9 @@
 
 `VerticalHopper` has the equations, which the other two reuse. A foot that rests on rigid ground has
 no states in its chart. Each class cites its source; examples, tests and benchmarks rely on the
-default parameters. If a motion is wrong, look at `leg` (the force between both masses) and
-`_moving`; if an event is, at its guard in `transitions`.
+default parameters. If a motion is wrong, look at `leg` (the force between both masses), then at the
+field of the chart: `_moving`, `pushed` in `charts`, or `_standing` of the pair. If an event is
+wrong, look at its guard in `transitions` (`_step` of the pair).
 """
 
 import itertools

@@ -2,7 +2,8 @@
 
 The first two are `DrivenNeuron`s: a periodic current, times in ms, and a reset at the `peak`. The
 third has no reset and no units. Each class has its equations and its source in the docstring; tests
-rely on the default parameters. If spikes are wrong, look at `transitions` and `after_spike`.
+rely on the default parameters. If a spike comes at a wrong time, look at `_membrane`, and at the
+guard in `transitions`; if the state after it is wrong, at `after_spike`.
 """
 
 import abc

@@ -4,7 +4,7 @@
 crossing of the cycle's section, until it is so close to the cycle that the phase response
 (`responses.py`) is accurate. The time that has passed, minus whole periods, then gives the phase.
 If a state does not reach the cycle, look at the search (`engine/move.py`); if a phase is
-inaccurate, at `near`.
+inaccurate, at `near`, the distance below which it counts as linear.
 """
 
 from typing import Any

@@ -9,10 +9,11 @@ If these derivatives are equal, as for events that do not influence each other, 
 *commute*, and the flow is differentiable.
 
 `find.py`, `limit_cycles.py` and `flow.py` call `commutes` or `groups_on`. Coinciding events are
-found by `_coincidence`, and every order of them is computed by `_orders`.
+found by `groups_on`, and every order of them is computed by `_orders`.
 
-If events count as simultaneous and are not, look at `SAME` and `_coincidence`; if their effect is
-judged wrongly, compare the orders in `_orders`, and the test in `_commute`.
+If events count as simultaneous and are not, look at `groups_on` and at `TOGETHER`
+(`systems/transition.py`); if an event is not counted, at `_missed` and `_rivals`. If their effect
+is judged wrongly, compare the orders in `_orders`, then look at `_commute` and `SAME`.
 """
 
 import itertools

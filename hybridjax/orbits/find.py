@@ -274,7 +274,7 @@ def _once(
     that cycle is returned.
 
     Systems are equal if they compute the same, also if they are of a class that was defined again,
-    as by a cell of a notebook that is run again (see `meaning.py`).
+    as by a cell of a notebook that is run again (see `_core/meaning.py`).
     """
     if is_inside_program() or not program_digest(system):
         return search()

@@ -5,8 +5,9 @@ states and simulates for `settle`. If no clock drives the system, it then flows 
 back to it (`_on_section`). The time between gives the first guess of the period.
 
 If a search begins at a wrong place, look at these stages in turn; if the section is not found, at
-`_next_crossing`; if a wrong section is proposed, at `after_rarest_event` and `met_once`. The
-constants limit how long it looks: change them if guesses are given up too early.
+`_next_crossing`; if a cycle gets an unsuitable section, at `_on_section`, and at
+`after_rarest_event` and `met_once`, which `find.py` calls for another one. The constants limit how
+long it looks: change them if guesses are given up too early.
 """
 
 import dataclasses

@@ -9,7 +9,8 @@ further kind of attempt, such as a restart from a random state, is added there. 
 implicit (`_root_jvp`, `_solve_along`).
 
 If a search fails without need, look at the attempts in turn; if its result depends on the executor,
-compare the two iterations; if a derivative is wrong, look at `_root_jvp`.
+compare the two iterations. If a derivative is wrong, look at `_solve_along`, and inside of programs
+at `_root_jvp`.
 """
 
 import dataclasses

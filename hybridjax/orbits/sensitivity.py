@@ -7,8 +7,9 @@ Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
 `LimitCycle.sensitivity` calls `sensitivity`. `_sensitivity` drives the linear flow of the cycle
 (`linear_flow.py`) with a constant input, and closes it over one period (`responses.closing`).
 
-If the period is wrong, look at `closing`; if only times of events are, at the delays of
-`LinearFlow.driven`; if they are all off by the same time, at `section_delay`.
+If the derivative of the period is wrong, look at `closing`, and with a clock at
+`by_parameter_of_period`. If only those of times of events are, look at the delays of
+`LinearFlow.driven`; if they are all off by the same number, at `section_delay`.
 """
 
 from typing import Any

@@ -2,8 +2,15 @@
 of a model.
 
 Each function draws one type of result. `first_of_data.py` registers them, so that `result.plot()`
-finds them. Most draw fields of the result as they are: if a figure shows wrong numbers, look at
-these first. A figure for a further type is a function here, and a line there.
+finds them; only `phase_response` is also a function of `hj.plot`, with checked arguments. A figure
+for a further type is a function here, and a line there. Colors and sizes come from `look.py`, and
+may be chosen otherwise. Every figure must also fit into Axes of users: it takes `ax`, and gets its
+panels from `look.panels`.
+
+Most functions draw fields of the result as they are: if a figure shows wrong numbers, look at these
+first, and then at what is computed here: standard deviations in `section_data`, bands of 1.96
+standard errors in `impulse_responses`, the unit of time in `phase_response`, and means over
+sections in `_stems`.
 """
 
 from typing import Any

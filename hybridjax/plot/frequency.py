@@ -5,8 +5,12 @@ models), and read curves with the radii of their confidence discs by `_values`. 
 magnitudes (`_magnitude`), `bode` magnitudes and phases (`_BodePanels`, with the axes of `_Scale`).
 A dict of HTFs becomes a grid of such panels (`_grid`).
 
+Colors and lines (`_line`, `_harmonic_style`, `_FIT_STYLE`) are a matter of taste. What is drawn is
+not: bands are those of `HTF.confidence_radius`, and a phase whose disc contains zero is left out.
+
 If a curve or a band is at wrong values, look at `_values`; if a phase is off by whole turns or
-missing, at `_phase` and at `is_certain` in `_BodePanels.response`; if units are wrong, at `_Scale`.
+missing, at `_phase` and at `is_certain` in `_BodePanels.response`. If the unit of frequencies is
+wrong, look at `_Scale`; if that of magnitudes is, at `_Curve.unit`, and for `htf` at `_magnitude`.
 """
 
 import contextlib

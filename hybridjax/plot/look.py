@@ -1,9 +1,10 @@
 """One look for all figures: sizes of a two-column paper, colors, fonts; and saving.
 
-Every function of `hj.plot` gets its Axes from `panels`, which makes a new figure in the package's
-style or takes the Axes of the user, and returns a `Plot`. Constants are a matter of taste and may
-be changed, for all figures at once; settings of matplotlib outside of `style` must not be. Helpers
-for labels and legends follow (`axis_of`, `legend`, `letters`).
+All figures that do not move get their Axes from `panels`, which makes a new figure in the package's
+style or takes the Axes of the user, and are returned as a `Plot`. (`motion.py` and `explorer.py`
+make their own figures, within `style`.) Constants are a matter of taste and may be changed, for all
+figures at once; settings of matplotlib outside of `style` must not be. Helpers for labels and
+legends follow (`axis_of`, `legend`, `letters`).
 
 If a figure is not shown in a notebook, look at `_load_backend` and `close_in_notebook`; if a file
 has a wrong name or format, at `_write`.

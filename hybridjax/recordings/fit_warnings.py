@@ -5,7 +5,7 @@
 one kind, and the constants are their limits. Findings about the signals themselves are made in
 `inspection/`.
 
-If a finding is missed or needless, look at the constant of its function.
+If a finding is missed or needless, look at the constants of the function that yields it.
 """
 
 from collections.abc import Iterator, Sequence

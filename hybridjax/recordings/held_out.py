@@ -2,9 +2,9 @@
 
 `split` divides records into a part to be fitted and a part to be held out. `Split.best_order` and
 `compare_orders` choose the number of multipliers by the errors on the held-out part; `hold_out`
-fits the first part and validates the fit on the rest. The constants say how much is held out. If
-too few strides are tested, look at `split`; if the chosen number is too large or too small, at
-`_AS_GOOD` and `_misfit`.
+fits the first part and validates the fit on the rest. A quarter is held out, and the constants
+limit it for long and short records. If too few strides are tested, look at `split`; if the chosen
+number is too large or too small, at `_AS_GOOD` and `_misfit`.
 """
 
 from typing import NamedTuple

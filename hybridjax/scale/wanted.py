@@ -47,7 +47,7 @@ class Wanted:
                 "functions of `quantities` need names of their own, other than "
                 f"{', '.join(sorted(taken))}: define them by `def`."
             )
-        # (Words only: workers get a copy.)
+        # (Only the words that are needed are kept: workers get a copy of this object.)
         s = Structure(system)
         self._charts = tuple(s.names)
         self._time_unit = str(system.time_unit or "")

@@ -6,8 +6,8 @@ A family is a definition and belongs to no cycle. `place_sections` (`place.py`) 
 piece of flow. A new kind of family is added here, as a subclass.
 
 If sections lie at wrong phases, look at `bind` of the family, and at `_first` (the anchor); if an
-angle is wrong, at `_AngleLevels.level` and `KinematicPhase._scaled`. If sections are placed well
-and crossed wrongly, look at `locate.py`.
+angle is wrong, at `_AngleLevels.level` and `KinematicPhase._scaled`. If the times or levels that
+`bind` returns are right, and the cycle meets the sections elsewhere, look at `locate.py`.
 """
 
 import abc

@@ -3,9 +3,10 @@
 
 It returns an `LDTP` with matrices A, B, C, D at each section. `_matrices` computes them from the
 Jacobians of the flow from section to section (`PlacedSections.between`) and from derivatives of the
-outputs (`_output_jacobians`). There are three ways, which must agree: on the host; in a program of
-JAX, along the recorded itinerary of a known cycle (`_on_walk`, see `walk.py`); and in a program, by
-a search (`_searched`). Delays of inputs and outputs are in `Delayed`.
+outputs (`_output_jacobians`). There are three ways, which must agree: on the host (`_matrices_of`,
+with derivatives `_matrices_along`); in a program of JAX, along the recorded itinerary of a known
+cycle (`_on_walk`, see `walk.py`); and in a program, by a search (`_searched`). Delays of inputs and
+outputs are in `Delayed`.
 
 If one way differs from the others, look at its function; if all matrices are wrong, at
 `PlacedSections.frames`; if only C and D are, at `_output_jacobians`.

@@ -2,8 +2,7 @@
 
 Users subclass `Chart`; `FieldChart` makes a chart from a function, and `DerivedChart` changes parts
 of another chart. The engine reads charts through `structure.py`. The names of attributes are public
-and must not change. If a chart of a user is refused, look at `Chart.__new__` and `_require_names`;
-if its motion is wrong, at its own `field`.
+and must not change. If a chart of a user is refused, look at `Chart.__new__` and `_require_names`.
 """
 
 import abc

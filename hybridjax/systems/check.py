@@ -6,10 +6,10 @@ outputs that users give. Each function of the user is traced once by JAX; `evalu
 of the user's code into a `DefinitionError` that says what to write. `_dependence` finds out from
 the traced program whether a function uses the time.
 
-If a good system is refused, the name in the error leads to its check: shapes to `_check_shape`,
-schedules to `check_schedules`, other functions to `_check_definition`. If a dependence on the time
-is missed or invented, look at `_dependence`; if an error of the user's code gets the wrong advice,
-at `_problem`.
+If a good system is refused, its error leads to the check: shapes to `_check_shape`, names to
+`_check_names` and `_check_all_names`, schedules to `check_schedules`, charts and transitions to
+`_check_definition`. If a dependence on the time is missed or invented, look at `_dependence`; if an
+error of the user's code gets the wrong advice, at `_problem`.
 """
 
 import contextlib

@@ -2,7 +2,8 @@
 that the workers would compute the same numbers.
 
 `run_on` is the entry. Results must be the same on all workers: if workers are refused without need,
-look at `_check_packages`. Files are written by the workers or here, never by both for one piece.
+look at `_check_packages` (versions) and `_unpacked` (users' modules); if a job cannot be sent, at
+`_Packer`. Files are written by the workers or here, never by both for one piece.
 """
 
 import contextlib

@@ -4,7 +4,8 @@ processes fill (`ZarrStore`).
 A piece is a block of points (`Blocks`). In a group it is a chunk of each variable, which appears
 complete or not at all and holds its own checksum. A piece is present when all its chunks are, so no
 list of finished pieces can be wrong; this must stay so, as processes may end at any time. Files are
-not trusted: sizes, links and checksums are tested before anything is read.
+not trusted: links, pipes and large descriptions on a disk are refused before anything is read
+(`_sizes`), and each chunk is read with its checksum.
 
 `run.py` opens a store by `open_store`, or makes it by `make_store`. If the store of an earlier call
 is refused, look at the `description` of the job, which must be equal; if a piece is computed again

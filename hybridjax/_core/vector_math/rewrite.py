@@ -7,7 +7,8 @@ reasons, accuracy). If a later JAX renames these equations, they are not found a
 results are right, and slower.
 
 If a rewritten program gives other results, look at the function that was put in (`trigonometry.py`,
-`factorizations.py`); if it is as slow as before, at the names of equations.
+`factorizations.py`); if it is as slow as before, at the names of equations (`function_of` in
+`jax_compat.py`) and at the conditions in `_ours` and `_solved`.
 """
 
 import functools as ft

@@ -17,8 +17,8 @@ functions that were written with `jnp`.
 Each has derivatives of all orders, in forward and reverse mode. Arguments are of float64.
 
 The coefficients and the pieces of pi/2 must not be changed by hand: the accuracy above holds for
-these. If a result is inaccurate, look whether its argument was reduced (|x| < 1.6e6), then at the
-polynomial.
+these. If `sin` or `cos` is inaccurate, look whether the argument is below 1.6e6, then at the
+reduction in `_sincos`; if an inverse function is, at `_arctan2`.
 """
 
 import math

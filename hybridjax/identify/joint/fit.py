@@ -6,7 +6,8 @@ covariance (`_finished`), and doubts about it. For records, it is also decided w
 depend on the input at their own section (D). The descent finds the minimum nearest to the first
 model: if a fit is poor, give a known model as `initial` to see whether there is a better minimum.
 
-If a covariance is wrong, look at `_finished`; if an iteration ends too early, at `descent.py`.
+If a covariance is wrong, look at `_finished`; if an iteration ends too early, at `settled` and
+`stalled` in `descent.py` of this folder.
 """
 
 import dataclasses

@@ -5,8 +5,9 @@ A reader gets a path and a `Wanted`, and returns a list of `Columns`: one for ea
 signals share their times. `parse_table` then separates times, events and signals, and finds units
 in headers. `reading` turns errors of libraries into a `FileFormatError`.
 
-If a unit is not found in a header, look at the patterns above `split_header`; if times have a wrong
-unit, at `time_unit`; if a broken file raises an error of a library, at `reading`.
+If a unit is not found in a header, look at `split_header`, and for a row of units at `is_unit`; if
+times have a wrong unit, at `time_unit`; if a broken file raises an error of a library, at
+`reading`.
 """
 
 import errno

@@ -7,8 +7,8 @@ A file is a list of elements: a tag (type, bytes) and its data. Arrays are eleme
 their flags, sizes and names; members of structs and cells are arrays in them. A compressed element
 holds one array (MAT-File Format, The MathWorks 2020, Ch. 1).
 
-If a good file is refused, look at `_array`, which reads the headers of all members; the numbers
-above are those of the format.
+If a good file is refused, look at `_array`, which reads the headers of all members, and at
+`_MEMBER`. All other numbers above, but `_PIECE`, are those of the format and must not be changed.
 """
 
 import math

@@ -13,8 +13,9 @@ models of other libraries estimate one variance of all errors instead.
 subject), and gets a `Mixed`, whose `contrast` gives differences. `moderated` first reduces the
 scatter of variances from few blocks.
 
-If a mean is wrong, look at `mixed` or `meta`; if its error or degrees of freedom are, at
-`Mixed.contrast`; if the spread between subjects is, at `spread_interval`.
+If a mean or the spread between subjects is wrong, look at `mixed`. If only the error of a mean is,
+look at the covariance there, or at that of `meta`; if its degrees of freedom are, at
+`Mixed.contrast`; if the interval of the spread is, at `spread_interval`.
 """
 
 from typing import Any, NamedTuple

@@ -3,8 +3,9 @@ the step that leads there from the one it was given.
 
 Tables for `leads.py`.
 
-`MAKERS` has for each class how to make one. If a message gives the wrong advice, change its line
-here.
+`MAKERS` has for each class how to make one, `STEPS` how to get one from another object, and
+`OBJECTS` the advice of a function for a type that it was given. If a message gives the wrong
+advice, change its line: `OBJECTS` is asked first, then `STEPS`, then `MAKERS`.
 """
 
 from .sentences import AT_TIMES
