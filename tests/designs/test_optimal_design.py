@@ -116,6 +116,7 @@ def test_fits_reach_what_is_promised(model):
     assert rms == pytest.approx(expected, rel=0.3)
 
 
+@pytest.mark.slow
 def test_units_and_estimates(isochron_ldtp, usual):
     """Forces of 1e-16, 0.01 and 1e6; an estimate in place of the model."""
     a, b, c = (

@@ -140,6 +140,7 @@ def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
     assert_array_equal(is_found, [*not_found, False, True])
 
 
+@pytest.mark.slow
 def test_a_comparator_that_would_trip_right_after_the_tick_is_seen_to_trip_before():
     """On the known cycle its guard is positive by so little that its sign is only rounding."""
     begin = hj.Guess("on", (0.3, 0.2), time=0.9)
@@ -290,6 +291,7 @@ class Kicked(hj.HybridSystem):
         return 1.0
 
 
+@pytest.mark.slow
 def test_derivatives_across_an_event_at_once():
     """Of the map x -> (1 + x exp(-rate))^2 0.4 between kicks, and of its fixed point."""
     system = Kicked()

@@ -142,6 +142,7 @@ def wrong_moves(map, expected):
 @pytest.mark.parametrize(
     "name", slow_but(hj.models.__all__, ("FitzHughNagumo", "VerticalHopper"))
 )
+@pytest.mark.slow
 def test_a_turn_with_its_moves_side_by_side(name, monkeypatch):
     """The same moves, with the same derivatives, as one after the other."""
     system = getattr(hj.models, name)()

@@ -91,6 +91,7 @@ def test_records_agree_with_scipy(family, design):
     assert np.max(error / scale) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_failing_experiment_leaves_the_others_intact(hopper_cycle, family, design):
     _, placed, _, data = family
     u = design.signals(CYCLES)

@@ -72,6 +72,7 @@ def test_an_event_may_change_places_with_a_section(responses):
     assert far_count < np.asarray(near).sum()
 
 
+@pytest.mark.slow
 def test_experiments_that_leave_the_table_are_run_again(campaign, responses):
     """`run` returns what a search finds, whatever the table can follow."""
     searched = responses[0]

@@ -54,6 +54,7 @@ def test_the_unit_of_residuals_does_not_count():
     assert steps_small <= steps
 
 
+@pytest.mark.slow
 def test_errors_that_no_residual_shows_are_unknown():
     juggler = hj.models.PaddleJuggler()
     impact = [hj.AtEvent("impact")]
@@ -92,6 +93,7 @@ def causes(fit):
     return [finding.cause for finding in fit.findings]
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_fit_says_that_its_errors_do_not_hold():
     """Another gravity changes speeds, which no amplitude of the paddle does."""
     data = juggled(noise=1e-3)
@@ -112,6 +114,7 @@ def test_a_model_that_does_not_fit_says_that_its_errors_do_not_hold():
     assert causes(hj.fit_model(wrong, data, ("A", "g"))) == []
 
 
+@pytest.mark.slow
 def test_data_without_noise_are_no_misfit_whatever_their_errors_are_said_to_be():
     for std in (1e-3, 1e-10):
         fit = hj.fit_model(hj.models.PaddleJuggler(A=0.17), juggled(std=std), "A")
@@ -235,6 +238,7 @@ def test_errors_are_as_large_as_they_are_said_to_be(oscillation):
         hj.fit_model(oscillation.system, unseen, ("p", "q", "w"), guess=oscillation)
 
 
+@pytest.mark.slow
 def test_advice_about_searches_names_their_function(oscillation):
     still = Oscillator(w=0.0)
     data = observed(oscillation)

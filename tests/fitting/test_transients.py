@@ -98,6 +98,7 @@ def test_parameters_and_starts_of_two_drops_are_those_of_scipy():
     assert_allclose(float(fit.system.e), TRUE["e"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_times_of_events_alone_identify_the_restitution():
     _, bounces = drop(1.0)
     begin = hj.Guess("main", (1.0, 0.0))
@@ -118,6 +119,7 @@ def test_values_of_one_output_need_no_second_axis():
         hj.fitting.ObservedTrajectory(begin, (0.1, 0.2, 0.3, 0.4), ("y", "v"), y)
 
 
+@pytest.mark.slow
 def test_prints_have_the_digits_that_errors_leave():
     data = observed(1.0, seed=0)
     assert " known=" not in repr(data)  # (It would list the place of each sample.)
@@ -194,6 +196,7 @@ def test_bad_measurements(call, message):
         call(hj.fitting.ObservedTrajectory)
 
 
+@pytest.mark.slow
 def test_bad_fits():
     with pytest.raises(
         DefinitionError, match="`unknown_states` has 'x', which is no state"
@@ -206,6 +209,7 @@ def test_bad_fits():
         hj.fit_model(ball(), late, "e")
 
 
+@pytest.mark.slow
 def test_a_push_with_kinks_needs_more_steps_and_the_error_says_so():
     """The parameter of an oscillator that was pushed, from the samples of a recording."""
     oscillator = hj.models.VanDerPol(mu=1.0)

@@ -73,12 +73,14 @@ def two_pieces(x, first, second):
     return hj.errors.Result(code), int(lanes.events[0])
 
 
+@pytest.mark.slow
 def test_a_guard_that_a_new_input_makes_positive_is_armed():
     found = two_pieces(-0.5, 0.0, 1.6)
     assert found == (hj.errors.Result.OK, 1)
 
 
 @pytest.mark.parametrize("size, time", [(1e4, 0.0), (1.0, 3e3)])
+@pytest.mark.slow
 def test_an_event_that_leaves_its_guard_at_zero_up_to_rounding_happens_once(size, time):
     """100 systems with other levels: they differ by how their guards are rounded."""
     duration = 1 / 32

@@ -125,6 +125,7 @@ def test_bandwidths_and_drifts_beyond_all_records():
     )
 
 
+@pytest.mark.slow
 def test_settings_of_jax_for_the_lines_of_users():
     """A user may forbid that JAX broadcasts and converts; lines of this package do both."""
 

@@ -61,6 +61,7 @@ def test_curved_sensors_are_not_called_distortion():
 
 
 @pytest.mark.parametrize("process", [0.0, 0.2])
+@pytest.mark.slow
 def test_noise_of_linear_systems_is_not_called_distortion(process):
     found = [
         causes(hj.fit_series(series(k, 0.0, 60, 0.1, process), 1, check=False))

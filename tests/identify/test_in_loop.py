@@ -157,6 +157,7 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
         assert htf.error(plant.htf(htf.frequencies)) < 1e-9
 
 
+@pytest.mark.slow
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
     truth = None
     held = []
@@ -188,6 +189,7 @@ def test_regions_of_series_hold_in_the_loop(plant):
     )  # (less: one in 2500)
 
 
+@pytest.mark.slow
 def test_instruments_of_series_hold_in_the_loop(plant):
     fit = hj.fit_series(series(plant, 0), 2, references="r")
     assert fit.compare(plant.multipliers).max_error < 1e-8  # (without noise)
@@ -268,6 +270,7 @@ def test_fits_without_a_reference_tell_of_the_controller(plant):
     assert not hj.fit_ldtp(data, 2, noise="innovations").findings
 
 
+@pytest.mark.slow
 def test_whether_outputs_answer_at_once_is_found(plant):
     for waits, through in ((False, 0.0), (True, 0.0), (True, 1.0)):
         data = series(plant, 5, noise=0.0, waits=waits, through=through)
@@ -320,6 +323,7 @@ def test_a_plant_that_is_stable_in_its_loop_only():
         assert error < 0.1
 
 
+@pytest.mark.slow
 def test_residuals_tell_of_the_loop(plant):
     early, late = (series(plant, seed, noise=0.5) for seed in (5, 6))
     fit = hj.fit_ldtp(early, 2, references="r")

@@ -151,6 +151,7 @@ def test_exact_htfs_give_the_exact_model(model, exact, variance):
     )
 
 
+@pytest.mark.slow
 def test_too_few_dimensions_are_named_in_strong_noise(hopper_cycle):
     """20 dB, at which the misfit is 1.6 times the expected one."""
     sections = hj.ClockPhase(8)

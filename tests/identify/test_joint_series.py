@@ -162,6 +162,7 @@ def test_too_few_dimensions_are_named(small):
 
 
 @pytest.mark.parametrize("through", (0.0, 1.0))
+@pytest.mark.slow
 def test_inputs_that_their_past_determines(through):
     """Only fits with D and without it tell whether outputs answer two lines at once."""
     model = scaled(5, (2, 2, 2), 1, 1)
@@ -233,6 +234,7 @@ def test_periodic_series_and_their_htfs_agree(small):
     )
 
 
+@pytest.mark.slow
 def test_noise_that_drives_the_system_is_found(small):
     """The spectrum of the fit is that of the truth; predictions are white, simulations are not."""
     noise = driven(small, 0.3)

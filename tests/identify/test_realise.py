@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from hypothesis import given, settings, strategies as st
 
 import hybridjax as hj
@@ -51,6 +52,7 @@ def test_random_systems(shape, seed):
         )
 
 
+@pytest.mark.slow
 def test_from_a_fit_to_a_noisy_record(hopper, multipliers):
     """States below the noise are left out, and what is left predicts well."""
     data = record(hopper, 32 * 300, 3)

@@ -235,6 +235,7 @@ def test_experiments_are_used_from_their_start(small):
     )
 
 
+@pytest.mark.slow
 def test_spurious_multipliers_raise_an_error(small):
     for seed in range(4):
         data = record(small, 400, seed, 0.3)
@@ -245,6 +246,7 @@ def test_spurious_multipliers_raise_an_error(small):
     assert "support 2 multipliers, not 3" in repr(hj.fit_series(data, 3, check=False))
 
 
+@pytest.mark.slow
 def test_an_order_that_is_too_low_is_noticed(small):
     """One multiplier of a pair; with the right order, nonlinear outputs are no reason for doubt."""
     for seed in range(2):

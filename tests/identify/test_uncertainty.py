@@ -162,6 +162,7 @@ def pair_and_real():
     ), rng
 
 
+@pytest.mark.slow
 def test_first_order_covariances_and_regions(pair_and_real):
     """Against the roots of coefficients drawn at random."""
     estimate, rng = pair_and_real

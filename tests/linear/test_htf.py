@@ -83,6 +83,7 @@ def test_prediction_is_the_periodic_response(seed, shape):
     assert_allclose(predicted, expected, rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_derivatives_by_matrices_and_frequencies(synthetic):
     @jax.jit
     def values(A, B, C, D, f):

@@ -156,6 +156,7 @@ def worn(t, q, u):
     )
 
 
+@pytest.mark.slow
 def test_a_singular_mass_matrix_ends_the_trajectory_with_its_cause():
     chart = Field(("x", "y", "vx", "vy"), worn)
     system = toy({"move": chart})

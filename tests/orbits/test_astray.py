@@ -29,6 +29,7 @@ class Pumped(hj.HybridSystem):
         return {"plane": Swing()}
 
 
+@pytest.mark.slow
 def test_a_search_for_two_periods_leaves_the_rest_to_which_newtons_method_leads():
     system = Pumped()
     guess = hj.Guess("plane", (0.15, 0.05))

@@ -73,6 +73,7 @@ def test_a_period_that_does_not_follow_a_parameter():
         )
 
 
+@pytest.mark.slow
 def test_a_force_that_jumps_with_the_clock():
     """The cycle of x' = -x + (1, then 0, for half a period each), by hand."""
 

@@ -74,6 +74,7 @@ def test_fold_and_flip_of_the_juggler(juggling, by_amplitude):
         assert_allclose(again.anchor.q, cycle.anchor.q, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_neimark_sacker_of_the_juggler(juggling):
     """The product of the multipliers is the restitution's square: 1 where nothing is lost."""
     branch = hj.continuation(juggling, "restitution", (0.7, 1.1))
@@ -152,6 +153,7 @@ def test_the_closed_form_holds_at_both_ends(juggling, parameter, factor, step):
     "system, parameter",
     [(m.PaddleJuggler, "T"), (m.BuckConverter, "T"), (Switched, "duty")],
 )
+@pytest.mark.slow
 def test_derivatives_of_a_turn_by_a_clock_are_differences(system, parameter):
     cycle = hj.find_limit_cycle(system())
     curve = Curve(cycle, parameter, 1.0)

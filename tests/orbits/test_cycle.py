@@ -120,6 +120,7 @@ def test_van_der_pol(mu):
     assert cycle.is_stable == (mu > 0)
 
 
+@pytest.mark.slow
 def test_a_guess_where_the_states_are_fast_leads_to_a_slow_cycle():
     """v' = 1 + v^2 from -1 to 1e5, in the time atan(1e5) + pi/4; at the guess a millionth of it."""
 
@@ -216,6 +217,7 @@ def test_a_plane_that_turns_meet_twice_is_replaced_by_an_event():
     assert_allclose(cycle.period, 2 * half, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_flow_that_comes_to_rest_is_no_cycle():
     def charging_rates(t, q, u):
         return (2.0 - q[0],)
@@ -255,6 +257,7 @@ def test_a_conservative_system_has_a_family_of_cycles(amplitude=7.3):
     assert_allclose(cycle.period, 2 * np.pi, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_equilibrium_is_no_cycle():
     """Below the unstable cycle of mu < 0 all spirals into the origin."""
     with pytest.raises(hj.errors.ComputationError, match="ended in an equilibrium"):

@@ -88,6 +88,7 @@ BALLS = hj.Guess("air", (0.1, 4.7, 0.1, 4.7), 0.1)
 
 
 @pytest.mark.parametrize("by_rough_turns", [True, False])
+@pytest.mark.slow
 def test_events_that_coincide_in_either_order(by_rough_turns, monkeypatch):
     """Balls that know nothing of each other: twice the multipliers of one, also if the search puts
     both impacts at the same time to the last bit."""

@@ -66,6 +66,7 @@ def test_ends_at_a_time_an_event_a_number_of_events_and_a_section():
     assert third.count == 1
 
 
+@pytest.mark.slow
 def test_figures_and_tables_are_those_of_its_steps():
     found = hj.flow(ball(), DROP, 1.0)
     assert found.plot().axes.shape == (2, 1)
@@ -108,6 +109,7 @@ def test_what_goes_on_from_a_flow():
     assert program(1.0).result == Result.OK
 
 
+@pytest.mark.slow
 def test_events_are_counted_from_each_start():
     @jax.jit
     def program(height):
@@ -281,6 +283,7 @@ def test_derivatives_by_the_end_the_section_the_input_and_times_between():
     assert_allclose(jax.grad(by_time)(1.5), 4.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_at_a_state_of_rest():
     """Its own error would allow any step, but that of the derivative does not."""
 
@@ -451,6 +454,7 @@ class Wall(hj.HybridSystem):
         return [hj.Transition("hit", "swing", "swing", distance, reset=stop)]
 
 
+@pytest.mark.slow
 def test_a_guard_that_is_touched():
     """Rounding decides whether the wall is hit, and would be the derivative."""
 
@@ -487,6 +491,7 @@ def test_a_guard_that_is_touched():
     assert_allclose(reverse(1.0 - 1e-6), -np.cos(4.0), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_guard_that_turns_where_it_is_touched():
     """Guards of time and of state, `1 - cos(t) + off`, that turn at zero, or a few errors of steps
     above or below: the search comes to the touch in steps that shrink."""
@@ -602,6 +607,7 @@ def dragged():
     return hj.HybridSystem.from_functions(("y", "v"), fall, events, inputs=())
 
 
+@pytest.mark.slow
 def test_rounding_does_not_shorten_steps_for_derivatives():
     """The error of a derivative is estimated by a difference. If that was as small as rounding at
     an accuracy of 1e-12, flows with derivatives had three times as many steps."""
@@ -648,6 +654,7 @@ def test_an_end_before_the_start_is_a_code_in_programs():
     assert program(0.1).result == Result.OK
 
 
+@pytest.mark.slow
 def test_a_flow_that_ends_where_it_starts():
     def end(begin, t):
         start = hj.Guess("main", (1.0, 2.0), begin)
@@ -795,6 +802,7 @@ def counters(n):
 
 
 @pytest.mark.parametrize("n", [3, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_each_of_several_events_that_coincide_happens_once(n):
     """None is due again after the others, also where a flow ends right after them."""
     start = hj.Guess("main", jnp.zeros(n + 1))
@@ -911,6 +919,7 @@ def test_a_longest_duration_that_is_far_too_long():
     assert_allclose(first.t, FIRST, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_ends_that_are_not_reached():
     """Errors name the end, and a guard that the start lies beyond."""
     high = hj.Crossing("y", "rising", 3.0)
@@ -937,6 +946,7 @@ def test_ends_that_are_not_reached():
         ({"until": hj.Crossing("v", "falling", -3.0)}, 3.0 / 9.81),
     ],
 )
+@pytest.mark.slow
 def test_no_end_later_than_within(end, time):
     """The last step may go on beyond `within`."""
 
@@ -972,6 +982,7 @@ def _at_times(t):
 
 
 @pytest.mark.parametrize("function", [_of_constants, _at_times])
+@pytest.mark.slow
 def test_what_is_constant_in_a_program_has_values(function):
     """What no traced number enters is computed while a program is traced, as it is outside."""
     value, slope = jax.value_and_grad(function)(0.55)

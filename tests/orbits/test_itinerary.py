@@ -140,6 +140,7 @@ def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
     assert result(2.0) == hj.errors.Result.EVENT_ORDER
 
 
+@pytest.mark.slow
 def test_an_event_in_the_last_step_of_a_turn_is_noticed():
     """Also if the guard is positive again where the turn ends."""
     gain = amplitude(1.0)
@@ -157,6 +158,7 @@ def test_an_event_in_the_last_step_of_a_turn_is_noticed():
     assert result(1.0005 / gain) == hj.errors.Result.EVENT_ORDER
 
 
+@pytest.mark.slow
 def test_gradients_inside_of_programs_are_differences():
     """By the field's parameters, and by the rate of the clock, which sets the period. (With the
     rebound, multipliers depend on the state, too.)"""
@@ -274,6 +276,7 @@ def test_programs_of_many_systems_factorize_nothing(free):
     assert "@lapack_" not in text
 
 
+@pytest.mark.slow
 def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
     """With independent digits of the multipliers; the search would be an error."""
     guess = hj.find_limit_cycle(hj.models.VerticalHopper(k=10.05))
@@ -284,6 +287,7 @@ def test_the_route_itself_leads_to_the_papers_hopper(compiled, monkeypatch):
     assert_allclose(values[np.argmax(values.imag)], true, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_tick_that_leaves_the_turn_is_noticed(compiled):
     """The turn ends with the tick `up`, which comes later than the turn in other systems."""
     known = hj.find_limit_cycle(Pulses())
@@ -312,6 +316,7 @@ class Stop(Rebound):
         return [dataclasses.replace(bounce, enabled=is_fast)]
 
 
+@pytest.mark.slow
 def test_an_event_whose_predicate_fails_beside_the_known_cycle_is_noticed(compiled):
     known = hj.find_limit_cycle(Stop(drive=2.0))
     fastest = known.trajectory()("v")[1].max()
@@ -432,6 +437,7 @@ class Marked(hj.HybridSystem):
         return hj.Guess("on", (1.9,))
 
 
+@pytest.mark.slow
 def test_guards_that_have_fallen_in_the_same_chart_are_not_due_again():
     """Beside a known cycle, a mark that is past is negative and falls, but its event is over."""
     cycle = hj.find_limit_cycle(Marked())
@@ -463,6 +469,7 @@ class Driven(Rebound):
         return {"free": Detuned(self)}
 
 
+@pytest.mark.slow
 def test_a_drive_without_the_period_of_the_clock_is_refused_at_every_door(compiled):
     known = hj.find_limit_cycle(Driven())
     with pytest.raises(hj.errors.DefinitionError, match="does not have the period"):

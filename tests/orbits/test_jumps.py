@@ -78,6 +78,7 @@ def is_refused(cycle, further):
         lambda x: 1e-3 * (1 + ((x - 0.5) / 1e-4) ** 2) ** -4,
     ],
 )
+@pytest.mark.slow
 def test_a_jump_is_refused(smooth, further):
     assert is_refused(smooth, further)
 
@@ -92,6 +93,7 @@ def test_a_jump_is_refused(smooth, further):
         pytest.param(lambda x: 1e-3 * jnp.interp(x, GRID, jnp.sin(GRID)), marks=SLOW),
     ],
 )
+@pytest.mark.slow
 def test_a_continuous_field_is_not(smooth, further):
     assert not is_refused(smooth, further)
 

@@ -56,6 +56,7 @@ def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
         (BEAT, (0.6,), {"multiplicity": 2}, "closes sooner than after the 2 periods"),
     ],
 )
+@pytest.mark.slow
 def test_what_is_no_cycle(system, guess, options, message):
     x, *time = guess
     with pytest.raises(hj.errors.HybridJaxError, match=message):
@@ -209,6 +210,7 @@ def test_constants_in_float32_are_exact():
     assert_allclose(cycle.period, 6.663286859, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_zeno_is_named_although_newton_went_elsewhere():
     """Two tanks with one hose, which goes to the tank that falls to 1: they lose 0.25 together, so
     that the hose has to be in both within a finite time."""

@@ -509,6 +509,7 @@ def _shifted(cycle, name, step):
     ],
     ids=["a clock that changes", "an event by the clock"],
 )
+@pytest.mark.slow
 def test_sensitivities_are_differences_of_cycles(system, name):
     cycle = hj.find_limit_cycle(system)
     change = cycle.sensitivity(name)
@@ -603,6 +604,7 @@ def test_results_have_derivatives_in_forward_and_reverse_mode(system, name, outp
     assert_allclose(jax.jacrev(result)(begin), forward, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_bad_questions_are_refused_in_one_sentence():
     hopper = hj.find_limit_cycle(hj.models.VerticalHopper())
     wheel = hj.find_limit_cycle(Neuron())

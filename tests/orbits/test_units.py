@@ -127,6 +127,7 @@ def test_a_state_that_rounding_moves_by_time_stops_nothing():
 
 
 @pytest.mark.parametrize("factor", [100.0, 0.5])
+@pytest.mark.slow
 def test_sizes_that_are_given(hopper_cycle, factor):
     """Others follow from the cycle, not from those with which the search begins."""
     settings = hopper_cycle.settings

@@ -114,6 +114,7 @@ def spikes_by_hand(state, drive=1.5, inhibition=0.2, count=200):
     return times[-2:]
 
 
+@pytest.mark.slow
 def test_a_guess_on_the_right_side_of_the_guards_finds_the_rhythm():
     # From between the thresholds Newton's method goes to the rest point beyond one of them.
     for chart, x in (("up", 0.0), ("down", 0.0), ("up", -0.9), ("down", 0.9)):
@@ -181,6 +182,7 @@ def test_sweeps_and_programs_refuse_a_cycle_beyond_a_guard():
         assert np.isnan(slope), "there is no cycle to differentiate"
 
 
+@pytest.mark.slow
 def test_a_branch_does_not_begin_beyond_a_guard():
     guess = hj.Guess("up", (0.0,))
     cycle = hj.find_limit_cycle(SchmittTrigger(), guess)
@@ -225,6 +227,7 @@ class Switched(hj.HybridSystem):
         return 1.0
 
 
+@pytest.mark.slow
 def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard():
     guess = hj.Guess("up", (0.0,), time=0.0)
     cycle = hj.find_limit_cycle(Switched(), guess)
@@ -238,6 +241,7 @@ def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard(
     assert cycle.multipliers == pytest.approx(expected_multipliers, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():
     guess = hj.Guess("up", (0.0,))
     good = hj.find_limit_cycle(SchmittTrigger(), guess)
@@ -292,6 +296,7 @@ class Swinging(hj.HybridSystem):
 
 
 @pytest.mark.parametrize("below", [0.0, 1e-14, 1e-12, 1e-10])
+@pytest.mark.slow
 def test_multipliers_that_are_only_rounding_are_refused(below):
     """Beside the separatrix, at the rate 2, deviations grow by more than 1e10, and shrink again:
     the multiplier, which is 1, comes out as -1.1 to 0.999, and the period as any."""

@@ -76,6 +76,7 @@ def fmu(tmp_path_factory):
     return folder / "vdp.fmu"
 
 
+@pytest.mark.slow
 def test_an_fmu_settles_where_the_equations_do_and_runs_in_processes(fmu):
     plant = hj.plants.FMUPlant(fmu, "u", ("x", "v"), dt=0.02)
     cycle = hj.plants.find_cycle(plant, SECTIONS, "x", cycles=8)

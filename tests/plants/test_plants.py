@@ -195,6 +195,7 @@ class Stairs:
         return {"v": self.v}
 
 
+@pytest.mark.slow
 def test_errors_contain_the_stairs_of_time_steps():
     """The mean slope lies in 95 % of the regions; the slope of one step does not, where the stairs
     are resolved."""
@@ -230,6 +231,7 @@ class FineStairs(Stairs):
         return super().step(u, duration - count * fine)
 
 
+@pytest.mark.slow
 def test_errors_contain_stairs_of_steps_that_a_plant_divides():
     """Phases of the grid that follow the sizes of the steps would look like curvature: the errors
     are then a third of the true ones."""
@@ -334,6 +336,7 @@ def test_an_unstable_cycle_is_found_from_a_guess():
     assert len(returns.multipliers) == 1
 
 
+@pytest.mark.slow
 def test_failures_are_named_and_the_others_go_on():
     cycle = hj.plants.find_cycle(Troubled(), ANGLE, "x", cycles=20)
     data = cycle.run_experiments(
@@ -459,6 +462,7 @@ def test_a_lasting_push_leads_to_another_cycle():
 @pytest.mark.parametrize(
     "family", ["isochron", pytest.param("kinematic", marks=pytest.mark.slow)]
 )
+@pytest.mark.slow
 def test_the_hopper_is_that_of_the_equations(hopper, family):
     """Perturbed returns against the exact multipliers; records against exact experiments."""
     outputs = ("yM", "vM")

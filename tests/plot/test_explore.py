@@ -16,6 +16,7 @@ from PIL import Image
 import hybridjax as hj
 
 
+@pytest.mark.slow
 def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     explorer = hj.explore(hj.models.RimlessWheel(), "slope")
     explorer.move({"slope": 0.1})
@@ -35,6 +36,7 @@ def test_a_slider_moves_the_cycle_loses_it_and_finds_it_again():
     assert_allclose(explorer.cycle.period, expected.period, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_an_event_passes_the_phase_at_which_the_clock_begins():
     explorer = hj.explore(hj.models.VerticalHopper(), "k")
     explorer.move({"k": 14.4})  # (at 10 it is in flight, here in stance)
@@ -42,6 +44,7 @@ def test_an_event_passes_the_phase_at_which_the_clock_begins():
     assert float(explorer.cycle.system.k) == 14.4
 
 
+@pytest.mark.slow
 def test_the_widget_sends_pictures():
     pytest.importorskip(
         "anywidget", reason="pip install 'hybridjax[explore]' installs it"
@@ -82,6 +85,7 @@ def test_what_is_refused(names, options, message):
         hj.explore(hj.models.VanDerPol(), *names, **options)
 
 
+@pytest.mark.slow
 def test_a_window_marks_the_picture_while_it_searches(monkeypatch):
     explorer = hj.explore(hj.models.VanDerPol(), "mu")
     seen = []

@@ -73,6 +73,7 @@ def test_files_and_refusals(walk, tmp_path):
         hj.plot.animate(walk.trajectory(), perturbed=walk.trajectory())
 
 
+@pytest.mark.slow
 def test_both_halves_of_a_cycle_are_drawn():
     duffing = hj.models.Duffing()
     half = hj.find_limit_cycle(

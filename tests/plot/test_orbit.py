@@ -39,6 +39,7 @@ def test_names_of_events_keep_apart(hopper_cycle):
     assert not first.padded(3).overlaps(second)
 
 
+@pytest.mark.slow
 def test_a_cycle_that_was_not_found_is_refused():
     far = hj.Guess("flight", (1e3, 30.0, 1.0, 5.0))
     failed = hj.find_limit_cycle(hj.models.VerticalHopper(), far, throw=False)

@@ -185,6 +185,7 @@ def test_the_period_of_a_cycle_is_in_its_own_unit(estimate):
         hj.plot.bode(estimate, unit="Hz", period=cycle("strides"))
 
 
+@pytest.mark.slow
 def test_a_branch_lists_the_lines_that_it_draws():
     cycle = hj.find_limit_cycle(hj.models.HopfOscillator())
     branch = hj.continuation(cycle, "mu", (0.1, 0.12), step=0.5)

@@ -95,6 +95,7 @@ def test_the_slope_in_several_dimensions_is_the_multiplier():
         assert f"slope {np.exp(-0.2):.4g}: multiplier" in lines
 
 
+@pytest.mark.slow
 def test_states_that_do_not_return_are_gaps():
     """x' = x^3 - x reaches infinity before t = 1 from above 1.0754, as its solution says."""
     system = hj.HybridSystem.from_functions(
@@ -114,6 +115,7 @@ def test_states_that_do_not_return_are_gaps():
     assert_allclose(inner, exact, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_wrong_coordinates_ranges_and_cycles_are_refused():
     cycle = hj.find_limit_cycle(Logistic())
     for options, message in (

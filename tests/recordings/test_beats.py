@@ -102,6 +102,7 @@ def test_forecasts_average_a_curve_over_the_jitter(found, noisy):
     assert "free of jitter" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_rate_that_wanders_is_no_memory():
     """The rate makes a random walk, 2 % from a cycle to the next, under a slow input."""
     rng = np.random.default_rng(0)
@@ -190,6 +191,7 @@ def slow_noise(rng, trials, samples, highest):
 
 
 @pytest.mark.parametrize("seed", range(2))
+@pytest.mark.slow
 def test_of_a_slow_input_the_band_is_wide_and_holds_the_curve(seed):
     """An input far slower than the rhythm says little of the shape, and does not exclude one."""
     rng = np.random.default_rng(seed)
@@ -235,6 +237,7 @@ def spikes_of_izhikevich(current, noise, adapts, step=0.05):
 
 
 @pytest.mark.parametrize("adapts", [True, False])
+@pytest.mark.slow
 def test_a_push_that_changes_the_next_interval_is_named(adapts):
     """The mean of a curve is the change of the rate by a constant current, unless the neuron
     adapts: then the intervals after a push take a part of its effect back."""

@@ -34,6 +34,7 @@ def test_cycles_from_apex_to_apex_tell_more(hopper_recording, hopper_cycle, angl
     assert not any(w.cause == "outputs" for w in by_apex)
 
 
+@pytest.mark.slow
 def test_spikes_of_twenty_deviations_change_little(hopper_recording, hopper_cycle):
     """Sixteen sections of four samples each, spikes in one per cent of force and outputs."""
     clean = add_artifacts(hopper_recording, noise=1e-4)

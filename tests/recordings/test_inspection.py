@@ -137,6 +137,7 @@ CAUSES = {
 @pytest.mark.parametrize(
     ("cause", "mishap"), [(c, x) for c in CAUSES for x in CAUSES[c]]
 )
+@pytest.mark.slow
 def test_causes_are_named(cause, mishap):
     phase = hj.AtEvent("top") if mishap in EVENT_MISHAPS else TOP
     named = causes(mishandle(made_up(0), mishap, **NAMES), phase)

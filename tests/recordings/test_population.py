@@ -353,6 +353,7 @@ def smooth(rng, n):
     return np.array([np.convolve(row, kernel, "valid") for row in rows])
 
 
+@pytest.mark.slow
 def test_groups_of_other_sizes_and_spreads_raise_no_alarm():
     """Of 120 pairs of equal means 5 % differ. (By permutations of labels 36 %.)"""
     rng = np.random.default_rng(0)
@@ -369,6 +370,7 @@ def test_groups_of_other_sizes_and_spreads_raise_no_alarm():
 
 
 @pytest.mark.parametrize("groups", [False, True])
+@pytest.mark.slow
 def test_bands_of_skewed_values_hold(groups):
     """Of 100 lognormal means, or differences of two; bands of sign flips hold 60 of the means."""
     rng = np.random.default_rng(1)

@@ -140,6 +140,7 @@ def test_gaps_are_masked_and_cut(wave):
     assert 0 < data.missing < 0.1
 
 
+@pytest.mark.slow
 def test_short_stretches_between_missed_events_and_a_pause(rhythm):
     """They count where they can; what is left out is counted and said."""
     marked = rhythm.mark("top", hj.Crossing("v", "falling"), bandwidth=16)

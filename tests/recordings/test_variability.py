@@ -49,6 +49,7 @@ def recorded(noise, strides=(300, 300), multiplier=0.6, seed=0, drift=0.0):
     return hj.Recording.join(trials)
 
 
+@pytest.mark.slow
 def test_a_recording_without_inputs_is_identified_by_its_variability(tmp_path):
     recording = recorded(0.2, strides=(120,))
     options = {"outputs": recording.signals, "n_sections": N, "bandwidth": np.inf}
@@ -138,6 +139,7 @@ def require_no_finding(cause, fit):
     assert cause not in [finding.cause for finding in fit.findings]
 
 
+@pytest.mark.slow
 def test_short_records_are_drawn_whole():
     """No interval is narrow because a record holds only one block."""
     short = variable(0.1, strides=(5,) * 12)
@@ -193,6 +195,7 @@ def turning(modulus, angle, cycles, seed):
     )
 
 
+@pytest.mark.slow
 def test_pairs_in_short_records_have_no_bias():
     """The formula for disturbances along the eigenvectors does not hold for those of a pair."""
     found = [

@@ -167,6 +167,7 @@ def test_nothing_of_others_is_read_or_replaced(tmp_path, harm):
     assert (victim / "1").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_cluster_gives_the_same_numbers(client, whole):
     assert hj.scale.monte_carlo(walk, DRAWS, seed=7, chunk=2, client=client).identical(
         whole

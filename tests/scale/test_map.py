@@ -61,6 +61,7 @@ def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     )
 
 
+@pytest.mark.slow
 def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     """With so few spokes on so flat a slope, a wheel does not get over its next spoke."""
     points = SweepPoints(
@@ -75,6 +76,7 @@ def test_a_point_without_a_cycle_touches_no_other(wheel, options):
     assert_allclose(np.delete(found.spectral_radius.values, 2), expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path):
     store = tmp_path / "map.zarr"
     first = hj.sweep(hj.models.RimlessWheel(), OVER, store=store, **options)
@@ -90,6 +92,7 @@ def test_a_store_is_resumed_and_checked_to_the_last_bit(whole, options, tmp_path
     assert (store / "period/c/0/1").stat().st_mtime_ns == kept
 
 
+@pytest.mark.slow
 def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
     store = tmp_path / "map.zarr"
     small = {name: x[:2] for name, x in OVER.items()}
@@ -120,6 +123,7 @@ def test_another_sweep_is_refused_by_its_difference(whole, options, tmp_path):
         run()
 
 
+@pytest.mark.slow
 def test_functions_of_parameters_lists_of_points_and_measures(wheel, whole):
     points = SweepPoints(
         {"slope": [0.075, 0.09, 0.075, 0.09], "spokes": [8.0, 8.0, 9.0, 9.0]}
@@ -166,6 +170,7 @@ def test_points_of_sobol_fill_the_box_and_are_always_the_same():
         assert_array_equal(values, expected)
 
 
+@pytest.mark.slow
 def test_sweep_draws_a_map(tmp_path, capsys):
     (tmp_path / "my_wheel.py").write_text(
         "from hybridjax.models import RimlessWheel as Mine\n"
@@ -216,6 +221,7 @@ def test_each_is_the_cycle_that_is_found_alone(hopper_cycle, monkeypatch):
     assert_allclose(others, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_a_clock_and_in_waves(wheel):
     """The wheel's multiplier is cos(2 pi / 8)^2 = 1/2 at any slope. At steep ones a step is so
     much shorter than the guess's that the flow from one impact passes the next."""

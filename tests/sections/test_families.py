@@ -79,6 +79,7 @@ def test_a_family_of_levels(vanderpol_cycle):
     assert_allclose(a.A, b.A, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_equal_arc_lengths(hopper_cycle, isochron_ldtp):
     """Measured along a trajectory that is sampled densely, between its events."""
     scale = np.array([0.3, 1.9])

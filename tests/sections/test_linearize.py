@@ -267,6 +267,7 @@ def test_sections_of_a_chart_with_one_state_have_the_dimension_zero(sections, di
     assert_allclose(data.y, 2 * data.u, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_section_map_waits_for_late_arrivals():
     """A ball 3 m/s faster than on the cycle flies for two periods: alone and inside of programs."""
     cycle = hj.find_limit_cycle(hj.models.PaddleJuggler())

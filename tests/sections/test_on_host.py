@@ -101,12 +101,14 @@ SLOW = [pytest.param(x, marks=pytest.mark.slow) for x in ("clock", "arc", "event
 
 @pytest.mark.usefixtures("compiles_none")
 @pytest.mark.parametrize("family", ["angle", *SLOW])
+@pytest.mark.slow
 def test_a_hopper(hopper_cycle, family):
     """Two charts, clock; the sections move with the cycle."""
     agrees(hopper_cycle.system, measured(hopper_cycle, FAMILIES[family]), 1e-8)
 
 
 @pytest.mark.usefixtures("compiles_none")
+@pytest.mark.slow
 def test_an_autonomous_wheel():
     """The period depends on the parameters, and the flow is projected out of the factors."""
     wheel = hj.models.RimlessWheel()
@@ -116,6 +118,7 @@ def test_an_autonomous_wheel():
 
 
 @pytest.mark.usefixtures("compiles_none")
+@pytest.mark.slow
 def test_numbers_of_sections(hopper_cycle):
     """A section is a definition, whose numbers have derivatives as those of systems."""
 

@@ -23,6 +23,7 @@ LAMBDA = -0.248983334735609 + 0.699333251798004j
 VDP = 8.59695063603805e-4
 
 
+@pytest.mark.slow
 def test_a_list_of_sections_of_every_kind(hopper_cycle):
     """State-based, on events, and in one chart only; the monodromy is that of the cycle."""
     table = [
@@ -142,6 +143,7 @@ def test_a_list_of_sections_is_sorted(vanderpol_cycle):
         ),
     ],
 )
+@pytest.mark.slow
 def test_what_is_wrong_with_a_section_is_said(sections, message, vanderpol_cycle):
     with pytest.raises(hj.errors.ComputationError, match=message):
         hj.sections.place_sections(vanderpol_cycle, sections)
@@ -169,6 +171,7 @@ def test_a_section_takes_the_time_and_the_state(hopper_cycle):
         hj.sections.place_sections(hopper_cycle, Crossing(level, "falling"))
 
 
+@pytest.mark.slow
 def test_sections_out_of_order_have_no_matrices_in_programs(vanderpol_cycle):
     """Their round takes two periods, and would give squares of multipliers."""
 
