@@ -111,3 +111,30 @@ def test_an_exact_output_hides_no_distortion_of_others():
     ]
     assert all("distortion" in x for x in bent)
     assert not any("distortion" in x for x in right)
+
+
+def test_standard_errors_under_distortion_are_those_of_a_jackknife():
+    """Each fit to the other blocks of cycles is another estimate. (The covariance for errors of
+    equal size is too small, because the fit hides the largest errors.)"""
+    blocks = 8
+    cycles = 80
+    data = series(0, 1.0, cycles)
+    samples = np.arange(len(data.y))
+    block = samples * blocks // len(samples)
+
+    def fitted(y):
+        part = dataclasses.replace(data, y=y)
+        return hj.fit_series(part, 1, extra_lags=10, check=False)
+
+    whole = fitted(data.y)
+    left_out = np.array(
+        [
+            fitted(np.where((block == b)[:, None], np.nan, data.y)).multipliers[0].real
+            for b in range(blocks)
+        ]
+    )
+    spread = left_out - left_out.mean()
+    expected = np.sqrt((blocks - 1) / blocks * (spread**2).sum())
+
+    assert "distortion" in causes(whole)
+    np.testing.assert_allclose(whole.standard_errors[0], expected, rtol=0.1)
