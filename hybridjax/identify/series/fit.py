@@ -636,19 +636,20 @@ def jackknife(
     that is right for errors of equal size is too small. The jackknife is not; for errors of equal
     size it is too large (HC3: MacKinnon and White, J. Econometrics 29, 1985).
 
-    **Arguments:** `stated`: the covariance for errors of equal size. It is returned if there are
-    too few blocks.
+    **Arguments:** `stated`: the covariance for errors of equal size. It is returned if it is
+    larger, or if there are too few blocks.
     """
     c = solution.c
     cycles = problem.records.cycles
     lags = denominator.correlated_cycles(multipliers_of(c), cycles)
     steps = [_step(linearize(part, c)) for part in _without_blocks(problem, lags + 1)]
     blocks = len(steps)
-    if blocks < len(c) + _FEWEST_LEFT_OUT:
+    if blocks < len(c) + _FEWEST_LEFT_OUT or not np.isfinite(stated.matrix).all():
         return stated
     deviation = np.array(steps) - np.mean(steps, axis=0)
     matrix = (blocks - 1) / blocks * deviation.T @ deviation
-    return Covariance(matrix, min(stated.dof, blocks - 1))
+    ratio = np.trace(np.linalg.solve(stated.matrix, matrix)) / len(c)
+    return Covariance(matrix, min(stated.dof, blocks - 1)) if ratio > 1 else stated
 
 
 def _step(solution: Linearization) -> Coefficients:

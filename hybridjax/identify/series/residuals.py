@@ -91,8 +91,8 @@ DISTORTED = Finding(
 )
 WIDENED = Finding(
     "distortion",
-    f"{_OF_PRODUCTS}, so standard errors are those of a jackknife, as a rule larger ones. Push "
-    "less: errors by distortion fall in proportion.",
+    f"{_OF_PRODUCTS}, so standard errors are those of a jackknife, if larger. Push less: errors by "
+    "distortion fall in proportion.",
 )
 UNSEEN = Finding(
     "feedback",
