@@ -1,7 +1,7 @@
 """Recordings to multipliers: errors, dirt, mishaps, spikes, coverage, a walker, cost.
 
 python benchmarks/recordings.py [errors] [dirt] [mishaps] [spikes] [walker] [size] [bag] [coverage]
-[quiet] [real]
+[quiet] [short] [real]
 
 does all of these by default. The systems are simulated and their multipliers known. Beside
 `fit_series` stands plain ARX: least squares on the same section data.
@@ -153,6 +153,11 @@ def quiet(draws=200):
     """Next to no noise: distortion is the misfit."""
     coverage(draws, noise=0.0, n_sections=N_SECTIONS, phases=PHASES)
     walks("van der Pol", *oscillator(), draws, 100, 5, 1e-4)
+
+
+def short(draws=40):
+    """Few strides for many lags, and no noise: distortion is the misfit."""
+    coverage(draws, strides=120, noise=0.0, chunk=20, phases=("apex",))
 
 
 def found_in(records, true):
@@ -542,6 +547,7 @@ ALL = (
     "bag",
     "coverage",
     "quiet",
+    "short",
     "real",
 )
 

@@ -432,37 +432,44 @@ def distortion(draws: int) -> None:
     those without another finding than distortion.
     """
     print(
-        "rhythm, noise, push                held  n   off  worst  distortion  silent  before"
+        "rhythm, noise, push, sections         held  n   off  worst  distortion  silent  before"
     )
-    quiet = [(name, 0.0, 1.0) for name in weakly.RHYTHMS]
     first = next(iter(weakly.RHYTHMS))
-    noisy = [(first, 1e-4, 1.0), (first, 1e-4, 0.1), ("pendulum clock", 3e-4, 0.1)]
-    for name, noise, size in [*quiet, *noisy]:
+    rows = [(name, 0.0, 1.0, 8) for name in weakly.RHYTHMS]
+    rows += [(first, 1e-4, 1.0, 8), (first, 1e-4, 0.1, 8)]
+    rows += [("pendulum clock", 3e-4, 0.1, 8)]
+    rows += [(first, 0.0, 1.0, 16), ("pendulum clock", 0.0, 1.0, 16)]
+    for name, noise, size, sections in rows:
         made = weakly.pushed(weakly.RHYTHMS[name], range(draws), noise=noise, size=size)
-        found = [_of_pushed(made, k) for k in range(draws)]
+        found = [_of_pushed(made, k, sections) for k in range(draws)]
         held = np.array([x[0] for x in found])
         off = np.array([x[1] for x in found])
         causes = [x[2] for x in found]
+        misses = [x for h, x in zip(held, causes, strict=True) if not h]
         named = sum("distortion" in x for x in causes)
-        silent = sum(not h and not x for h, x in zip(held, causes, strict=True))
-        before = sum(
-            not h and not x - {"distortion"} for h, x in zip(held, causes, strict=True)
-        )
-        label = f"{name}, {noise:g}, {size:g}"
+        silent = sum(not x for x in misses)
+        before = sum(not x - {"distortion"} for x in misses)
+        label = f"{name}, {noise:g}, {size:g}, {sections}"
         print(
-            f"{label:34} {held.sum():4} {draws:2} {np.sqrt(np.mean(off**2)):5.1f} "
+            f"{label:37} {held.sum():4} {draws:2} {np.sqrt(np.mean(off**2)):5.1f} "
             f"{off.max():6.1f} {named:11} {silent:7} {before:7}",
             flush=True,
         )
 
 
-def _of_pushed(made: weakly.Pushed, k: int) -> tuple[bool, float, set[str]]:
+def _of_pushed(
+    made: weakly.Pushed, k: int, sections: int
+) -> tuple[bool, float, set[str]]:
     """Return whether the region holds the multiplier, the error in standard errors, and causes of
     findings."""
     signals = {"u": made.force[k], "x": made.position[k], "v": made.speed[k]}
-    recording = hj.Recording(made.time, signals)
     result = hj.identify_recording(
-        recording, hj.Crossing("v", "falling"), "u", ("x", "v"), order=1, n_sections=8
+        hj.Recording(made.time, signals),
+        hj.Crossing("v", "falling"),
+        "u",
+        ("x", "v"),
+        order=1,
+        n_sections=sections,
     )
     fit = result.fit
     error = abs(fit.multipliers[0] - made.multiplier) / fit.standard_errors[0]

@@ -8,20 +8,43 @@ import pytest
 import hybridjax as hj
 
 
-def series(seed, bend, cycles=150, noise=0.0, process=0.0):
+TRANSIENT = 20
+"""The cycles that are simulated first and left out."""
+
+
+def slow_mode(rng, u, bend, process):
     """A slow mode (multiplier 0.72) that responds to its own square, times `bend`."""
-    rng = np.random.default_rng(seed)
-    n = 2 * (cycles + 20)
-    u = 0.01 * rng.normal(size=(n, 1))
-    x = np.zeros(n)
-    for k in range(n - 1):
+    x = np.zeros(len(u))
+    for k in range(len(u) - 1):
         decay, push = (0.9, 1.0) if k % 2 else (0.8, -0.7)
+        linear = decay * x[k] + push * u[k]
         kick = process * 0.01 * rng.normal()
-        x[k + 1] = decay * x[k] + bend * x[k] ** 2 + push * u[k, 0] + kick
-    y = np.stack([x, 0.5 * x + 0.3 * bend * x**2], axis=1)[40:]
+        x[k + 1] = linear + bend * x[k] ** 2 + kick
+    return x
+
+
+def deviations(y):
+    """Outputs less their means at each of two sections."""
+    by_cycle = y.reshape(-1, 2, 2)
+    centered = by_cycle - by_cycle.mean(axis=0)
+    return centered.reshape(y.shape)
+
+
+def series(seed, bend, cycles=150, noise=0.0, process=0.0):
+    """Two outputs of a slow mode, at two sections, with noise relative to the outputs."""
+    rng = np.random.default_rng(seed)
+    samples = 2 * (cycles + TRANSIENT)
+    u = 0.01 * rng.normal(size=(samples, 1))
+    x = slow_mode(rng, u[:, 0], bend, process)
+
+    curved = 0.5 * x + 0.3 * bend * x**2
+    y = np.stack([x, curved], axis=1)
+    settled = slice(2 * TRANSIENT, None)
+    y = y[settled]
     y += noise * y.std(axis=0) * rng.normal(size=y.shape)
-    y -= y.reshape(-1, 2, 2).mean(axis=0)[np.arange(len(y)) % 2]
-    return hj.experiments.SectionSeries(u[40:], y, n_sections=2, drift=np.inf)
+    return hj.experiments.SectionSeries(
+        u[settled], deviations(y), n_sections=2, drift=np.inf
+    )
 
 
 def causes(fit):
@@ -89,3 +112,30 @@ def test_an_exact_output_hides_no_distortion_of_others():
     ]
     assert all("distortion" in x for x in bent)
     assert not any("distortion" in x for x in right)
+
+
+def test_standard_errors_under_distortion_are_those_of_a_jackknife():
+    """Each fit to the other blocks of cycles is another estimate. (The covariance for errors of
+    equal size is too small, because the fit hides the largest errors.)"""
+    blocks = 8
+    cycles = 80
+    data = series(0, 1.0, cycles)
+    samples = np.arange(len(data.y))
+    block = samples * blocks // len(samples)
+
+    def fitted(y):
+        part = dataclasses.replace(data, y=y)
+        return hj.fit_series(part, 1, extra_lags=10, check=False)
+
+    whole = fitted(data.y)
+    left_out = np.array(
+        [
+            fitted(np.where((block == b)[:, None], np.nan, data.y)).multipliers[0].real
+            for b in range(blocks)
+        ]
+    )
+    spread = left_out - left_out.mean()
+    expected = np.sqrt((blocks - 1) / blocks * (spread**2).sum())
+
+    assert "distortion" in causes(whole)
+    np.testing.assert_allclose(whole.standard_errors[0], expected, rtol=0.1)

@@ -468,9 +468,8 @@ def _doubts(
     if not how.innovations:
         predicted = np.where(grid.sampled, grid.y - error, 0.0)
         c = fit.coefficients
-        distortion = residuals.about_distortion(grid, error, predicted, c)
-        if distortion:
-            return distortion
+        if residuals.is_distorted(grid, error, predicted, c):
+            return [residuals.DISTORTED]
     # (References never respond to outputs.)
     direct = fit._coordinates.direct or outside is not records
     return residuals.about_misfit(outside.whole(), grid, error, how.innovations, direct)

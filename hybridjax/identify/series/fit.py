@@ -3,10 +3,10 @@ error).
 
 `_fit_open_loop` takes the stages in order: a first c by regression (`delayed_outputs.py`), the
 minimum of the output error (`linearization.minimize`), a second minimum with outputs in units of
-their noise, the covariance of c from blocks of cycles (`_uncertainty`), and findings about order,
-drift and feedback. (c are the coefficients of the denominator chi.) With references, `in_loop.py`
-takes the place of the first four. A wrong multiplier has its cause in the minimum, a wrong error
-bar in `block_scores`.
+their noise, the covariance of c from blocks of cycles (`_uncertainty`; `jackknife` if residuals are
+distortion), and findings about order, drift and feedback. (c are the coefficients of the
+denominator chi.) With references, `in_loop.py` takes the place of the first four. A wrong
+multiplier has its cause in the minimum, a wrong error bar in `block_scores`.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ from ..denominator import (
     multipliers_of,
     sandwich,
 )
-from ..descent import Coefficients
+from ..descent import Coefficients, NormalEquations
 from ..fit import not_converged
 from ..instrument import in_loop
 from ..multiplier_estimate import (
@@ -83,12 +83,13 @@ from .records import (
     OF_DRIFT,
     CycleGrid,
     PreparedRecords,
+    count_cycles,
     divide_by_chi,
     lagged_inputs,
     start_responses,
     with_drift,
 )
-from .residuals import about_answers, about_distortion
+from .residuals import WIDENED, about_answers, is_distorted
 
 
 _BIASED = "the fit is biased; name their `references`"
@@ -128,7 +129,7 @@ class SeriesFit(MultiplierFit):
       multipliers (outside of each other's confidence regions); "order" if a fit with one or two
       multipliers more contradicts this fit in the same way; "feedback" if inputs depend on earlier
       residuals, as with a controller, so that the fit is biased; "distortion" if residuals follow
-      products of earlier responses, so that standard errors may be too small; "changing system" if
+      products of earlier responses (`covariance` is then that of a jackknife); "changing system" if
       the multipliers of earlier and later cycles differ; "undetermined"; "no convergence".
     """
 
@@ -410,7 +411,13 @@ def _fit_open_loop(
         ]
         doubts = order_doubts(fit, higher) or left_out(higher[0])
     changes = [_CHANGES] if p_steady < _STEADY else []
-    distortion = about_distortion(grid, error, predicted, fit.coefficients)
+    distortion = []
+    if is_distorted(grid, error, predicted, fit.coefficients):
+        distortion = [WIDENED]
+        wider = jackknife(best.problem, best.solution, covariance)
+        fit = dataclasses.replace(
+            fit, covariance=wider.matrix, covariance_dof=wider.dof
+        )
     return dataclasses.replace(
         fit, findings=(*fit.findings, *doubts, *distortion, *changes, *answers)
     )
@@ -576,6 +583,10 @@ _FILTERED_DRAWS = 16
 # Changes in time are tested if there are at least this many blocks more than coefficients. Fewer:
 # the test has no power.
 _FEWEST_BLOCKS = 6
+# A jackknife leaves out at least this number of blocks more than coefficients, and at most so many.
+# Fewer: it scatters. More: time.
+_FEWEST_LEFT_OUT = 3
+_MOST_LEFT_OUT = 20
 
 
 def coefficient_covariance(
@@ -611,6 +622,64 @@ def _uncertainty(
     gradient = scores.covariance()
     covariance = sandwich(curvature, gradient.matrix)._replace(dof=gradient.dof)
     return covariance, scores.trend()
+
+
+def jackknife(
+    problem: OutputErrorProblem, solution: Linearization, stated: Covariance
+) -> Covariance:
+    r"""Return the covariance of c from fits that leave out one block of cycles each.
+
+    $$\frac{B - 1}{B} \sum_b (c_b - \bar c)(c_b - \bar c)^T$$
+
+    (Delete-block jackknife: Künsch 1989.) Each $c_b$ is one Gauss-Newton step from c. Where errors
+    grow with the regressors, as distortion does, the fit hides the largest errors, and a covariance
+    that is right for errors of equal size is too small. The jackknife is not; for errors of equal
+    size it is too large (HC3: MacKinnon and White, J. Econometrics 29, 1985).
+
+    **Arguments:** `stated`: the covariance for errors of equal size. It is returned if it is
+    larger, or if there are too few blocks.
+    """
+    c = solution.c
+    cycles = problem.records.cycles
+    lags = denominator.correlated_cycles(multipliers_of(c), cycles)
+    steps = [_step(linearize(part, c)) for part in _without_blocks(problem, lags + 1)]
+    blocks = len(steps)
+    if blocks < len(c) + _FEWEST_LEFT_OUT or not np.isfinite(stated.matrix).all():
+        return stated
+    deviation = np.array(steps) - np.mean(steps, axis=0)
+    matrix = (blocks - 1) / blocks * deviation.T @ deviation
+    ratio = np.trace(np.linalg.solve(stated.matrix, matrix)) / len(c)
+    return Covariance(matrix, min(stated.dof, blocks - 1)) if ratio > 1 else stated
+
+
+def _step(solution: Linearization) -> Coefficients:
+    """Return a Gauss-Newton step from c."""
+    curvature = solution.curvature.sum(axis=0)
+    gradient = solution.gradient.sum(axis=0)
+    step, _ = NormalEquations(curvature, gradient).step(0.0)
+    return step
+
+
+def _without_blocks(
+    problem: OutputErrorProblem, cycles: int
+) -> Iterator[OutputErrorProblem]:
+    """Iterate over the blocks of all records: the problem without the samples of a block.
+
+    **Arguments:** `cycles`: the least length of a block.
+    """
+    records = problem.records
+    times = []
+    for grid, begins in zip(records.grids, records.begins, strict=True):
+        cycle = np.arange(grid.y.shape[1])
+        times.append(begins[:, None] + cycle)
+    total = sum(map(count_cycles, records.records))
+    blocks = min(total // cycles, _MOST_LEFT_OUT)
+    for block in range(blocks):
+        grids = [
+            grid.where(time * blocks // total != block)
+            for grid, time in zip(records.grids, times, strict=True)
+        ]
+        yield problem._replace(records=records.on(grids))
 
 
 class _BlockSums(NamedTuple):

@@ -5,6 +5,7 @@ and sorts them into grids of similar length. The functions at the end delay and 
 cycle to cycle (`lagged_inputs`, `divide_by_chi`). Missing samples are zero in a grid, and marked.
 """
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from itertools import chain
@@ -88,6 +89,11 @@ class CycleGrid(NamedTuple):
             drift=drift,
         )
 
+    def where(self, kept: Bool[np.ndarray, "S T"]) -> "CycleGrid":
+        """Return the grid without the outputs of other cycles than these."""
+        sampled = self.sampled & kept[:, :, None, None]
+        return self._replace(y=np.where(sampled, self.y, 0.0), sampled=sampled)
+
     @property
     def first(self) -> Int[np.ndarray, "S N"]:
         """The cycle in which each record first crosses a section."""
@@ -164,6 +170,12 @@ class PreparedRecords:
         """The fields that fits take from the records."""
         names = "n_sections", "lead", "inputs", "outputs"
         return {name: getattr(self, name) for name in names}
+
+    def on(self, grids: list[CycleGrid]) -> "PreparedRecords":
+        """Return these records with other grids, in the same order."""
+        out = copy.copy(self)
+        out.grids = grids
+        return out
 
     def whole(self) -> CycleGrid:
         """Return all records on one grid."""

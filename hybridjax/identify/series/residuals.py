@@ -1,9 +1,9 @@
 """Tests of residuals, section by section: correlations in time and with inputs.
 
 `hj.validate` calls `whiteness_test` and `independence_test` for data that were not fitted, and
-`whitened` to take the errors of the fit into account. Fits call `about_misfit`, `about_distortion`
-and `about_answers`, which return findings about residuals of the same data. If a good model is
-rejected, look at `whitened`; if feedback is reported where there is none, at `feedback_test`.
+`whitened` to take the errors of the fit into account. Fits call `about_misfit`, `is_distorted` and
+`about_answers` for residuals of the same data. If a good model is rejected, look at `whitened`; if
+feedback is reported where there is none, at `feedback_test`.
 """
 
 from collections.abc import Sequence
@@ -52,10 +52,10 @@ _COLORED = 0.01
 _SHIFTS = 8
 _ALONE = 4.0
 # Residuals are distortion if they follow products of responses at this level, by more than this
-# part of their squares. Larger level, smaller part: right fits get a finding. Smaller level, larger
-# part: distortion passes, and standard errors are too small.
+# part of their squares. Larger level, smaller part: right fits get a finding, and wider intervals.
+# Smaller level, larger part: distortion passes, and standard errors are too small.
 _DISTORTED = 3e-3
-_LEAST_DISTORTION = 0.12
+_LEAST_DISTORTION = 0.08
 # The largest number of patterns of a cycle of which products are taken, the number of shifts that
 # are compared, and the fewest cycles. More patterns: slow responses are lost among others. Fewer
 # shifts or cycles: the level is not held.
@@ -78,6 +78,21 @@ FOR_GIVEN_D = (
 FOR_ZERO_D = (
     "D = 0 was taken; if outputs answer inputs at the same section, name their "
     "`references`"
+)
+_OF_PRODUCTS = (
+    "residuals follow products of earlier responses, as nonlinear distortion does"
+)
+# The finding of fits whose standard errors are for errors that do not depend on the inputs, and of
+# fits whose standard errors are those of a jackknife.
+DISTORTED = Finding(
+    "distortion",
+    f"{_OF_PRODUCTS}: standard errors may be too small by a factor of two. Push less: errors by "
+    "distortion fall in proportion.",
+)
+WIDENED = Finding(
+    "distortion",
+    f"{_OF_PRODUCTS}, so standard errors are those of a jackknife, if larger. Push less: errors by "
+    "distortion fall in proportion.",
 )
 UNSEEN = Finding(
     "feedback",
@@ -323,27 +338,28 @@ def _of_other_cycles(inputs: Signals, error: Signals) -> ByOutput:
     return np.mean(deviates, axis=0)
 
 
-def about_distortion(
+def is_distorted(
     grid: CycleGrid, error: Signals, predicted: Signals, c: Coefficients
-) -> list[Finding]:
-    """Return a finding if residuals follow products of earlier responses, as nonlinearity makes
-    them.
+) -> bool:
+    """Return whether residuals follow products of earlier responses, as nonlinearity makes them.
 
     Such residuals depend on the inputs, and multipliers err together with them, by more than any
     residuals show that are independent of the inputs. Distortion adds up in the slowest modes:
     therefore only those patterns of a cycle count in which the responses are largest, and products
     that are filtered by 1 / chi. Curved sensors distort single samples, which does no such harm:
-    products of the same cycle are left out.
+    products of the same cycle are left out. Residuals of neighboring cycles are correlated, so that
+    chance explains more of them: all are filtered, by their lag-one correlation (Cochrane and
+    Orcutt 1949).
 
     **Arguments:** `error`, `predicted` outputs, on `grid`. `c`: the coefficients of chi.
     """
     # (Beside residuals that are rounding errors, those of the other outputs would not be seen.)
     tested = ~is_exact(grid, error)
     if not tested.any():
-        return []
+        return False
     kept = np.asarray(grid.inside.any(axis=2))
     if kept.sum() < _FEWEST_CYCLES:
-        return []
+        return False
     grid = grid._replace(sampled=grid.sampled[..., tested])
     error = error[..., tested]
     predicted = predicted[..., tested]
@@ -362,21 +378,25 @@ def about_distortion(
     earlier = divide_by_chi(fading(c), delay_cycles(now, 1))
     dynamic = _without_sensors(grid, left / noise, response)
     rest = dynamic.reshape(S, T, N * ny) @ patterns
+    correlation = _lag_one(rest)
+    rest, earlier, now = (
+        x - correlation * delay_cycles(x, 1) for x in (rest, earlier, now)
+    )
     share, by_chance = _explained(rest[kept], earlier[kept], now[kept])
     if len(by_chance) < _FEWEST_SHIFTS:
-        return []
+        return False
     mean = by_chance.mean()
     variance = positive(by_chance.var())
     # (Sums of squares are distributed like a multiple of chi squared.)
     p = stats.gamma.sf(share, mean**2 / variance, scale=variance / mean)
-    if p > _DISTORTED or share - mean < _LEAST_DISTORTION:
-        return []
-    text = (
-        "residuals follow products of earlier responses, as nonlinear distortion does: standard "
-        "errors may be too small by a factor of two. Push less: errors by distortion fall in "
-        "proportion."
-    )
-    return [Finding("distortion", text)]
+    return bool(p <= _DISTORTED and share - mean >= _LEAST_DISTORTION)
+
+
+def _lag_one(x: Float[np.ndarray, "S T k"]) -> float:
+    """Return the correlation of cycles with those before."""
+    before = x[:, :-1]
+    square = (before**2).sum()
+    return float((x[:, 1:] * before).sum() / positive(square))
 
 
 def _products(x: Float[np.ndarray, "*rows k"]) -> Float[np.ndarray, "*rows K"]:
