@@ -3,8 +3,8 @@ package.
 
 `as_method` converts any of these to a `Method`: the coefficients, in the form that
 `engine/runge_kutta.py` uses. `solvers` checks what a user gives for a system (one solver, or one
-for each chart). A further kind of solver is a case in `_as_method`. A `Method` must hold tuples and
-numbers only: solvers are compared and hashed.
+for each chart). A further kind of solver is a case in `_as_method`. A `Method` must hold tuples,
+numbers and text only: solvers are compared and hashed.
 
 If a solver is refused, look at the conditions in `_as_method`; if its errors are of the wrong
 order, at its coefficients (`_from_tableau`, `_radau`) and at `Method.order`.
