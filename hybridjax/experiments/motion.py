@@ -1,6 +1,13 @@
 """The whole motion of a single experiment, between sections, too.
 
-`perturbed_trajectory` is for animations and figures: data of experiments have the sections only.
+`perturbed_trajectory` is for animations and figures (`plot/motion.py` calls it): data of
+experiments have the sections only. It moves one lane from section to section, as `response.py`
+does, and keeps the recorded steps (`tape`). Times and events are counted within one turn, as there;
+`shift` turns them into times of the whole motion. It must grow only after the steps to section 0
+are stored: these begin in the turn before.
+
+If times jump at section 0, look at `shift`; if the motion differs from the data, look at the start,
+which is on the cycle here.
 """
 
 from typing import Annotated

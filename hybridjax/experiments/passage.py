@@ -8,8 +8,12 @@ passed). A *leg* is the way from one event or section to the next.
 
 A lane has left the table if a watched function (a guard, or the level of a section) has another
 sign than on the cycle or has dipped below zero (`_has_left`), a leg would last a negative time, a
-step has a larger error than planned, or an event was not found. If results differ from those of a
-search, look first at `_has_left`, then at `_landed` (times of events).
+step has a larger error than planned, or an event was not found. These tests must stay strict: only
+lanes that have left are computed again, all others are results.
+
+If results differ from those of a search, look first at `_has_left`, then at `_landed` (times of
+events); if `error` does, at `share` in `_leg`. If too many lanes leave the table, look at
+`rows.py`.
 """
 
 import functools as ft
@@ -114,11 +118,13 @@ def follow_table(
     N = len(course.bound.time)
     S, n, nu = u.shape
     moves = _Moves(course, plan, settings, feedback, form)
+    # One function for each kind of row.
     branches = [moves.of(body) for body in form.bodies]
     # Axes: periods, sections, inputs, lanes.
     held = jnp.transpose(u, (1, 2, 0)).reshape(n // N, N, nu, S)
 
     def turn(carry, held):
+        """All rows of one period, and the outputs (N, ny, S) at its sections."""
         outputs = jnp.zeros((N, len(moves.outputs.names), S))
         answers = jnp.zeros((N, nu, S))
 
@@ -145,6 +151,7 @@ def follow_table(
         return jnp.moveaxis(x, -1, 0).reshape(S, n, -1)
 
     y = to_experiments(y)
+    # A lane has left the table, too, if it is not back on section 0.
     finite = jnp.isfinite(end.q).all(axis=0) & jnp.isfinite(end.largest)
     left = end.left | ~finite | (end.place != BEGIN)
     response = Response(
@@ -231,12 +238,15 @@ class _Moves:
         """A step toward the end of a leg, or a correction of the time at which it ends."""
         a = body.chart
         q = x.q[: self.s.dims[a]]
+        # Outputs on a section; then the watched functions at the beginning of the step.
         x = self._observed(a, row, u, q, x)
         kept = _where(acts & row.begins, Kept.of(x), kept)
         u = self._applied(u, x)
         f = self._field(a, u)(x.t, q)
         value, rate = self._watched(a, row, u, x.t, q, f)
         left = x.left | self._has_left(a, row, x, value, rate)
+        # The length of the step: a part of the time to the end of the leg, a fixed length, or the
+        # last one.
         to_end = _at(self.ends, row.section) - x.t
         target = jnp.maximum(row.target, 0)
         if self._functions(a):
@@ -244,11 +254,13 @@ class _Moves:
             to_end = jnp.where(row.target >= 0, to_zero, to_end)
         planned = jnp.where(row.fixed > 0, row.fixed, row.part * to_end)
         h = jnp.where(row.begins | row.corrects, planned, x.h)
+        # The step, with its tests.
         end, error = self._stepped(a, u, x.t, q, h)
         left |= row.begins & (h < 0)
         left |= ~row.corrects & (error > _at(self.plan.slack, row.section))
         share = jnp.where(row.corrects, 0.0, error * _at(self.plan.weight, row.section))
         t = x.t + h
+        # On the next section: at its time, or at the zero of its level.
         by_time = row.arrives & (row.target < 0)
         t = jnp.where(by_time, _at(self.ends, row.section), t)
         if self._has_level(a):

@@ -7,7 +7,12 @@ error estimates of steps may be. It also converts error estimates of steps to er
 tolerances), on the cycle and near it, and takes the cheapest ones that keep the accuracy.
 
 A plan does not decide on events: experiments that leave the cycle are integrated as accurately,
-perhaps in more steps. If `ExperimentData.error` is wrong, look at `_impact` and `_accumulated`.
+perhaps in more steps. Estimates of steps are relative to the tolerance, and errors to the states'
+scales: `response.py` and `passage.py` rely on both, and this must stay so.
+
+If `ExperimentData.error` is wrong, look at `_impact` and `_accumulated`; if experiments take too
+many steps, at `_cheapest` (which candidate) and at `slack` in `make_plan` (how large estimates may
+be); if no candidate arrives, at `_try_ways`.
 """
 
 import contextlib
@@ -134,17 +139,20 @@ def make_plan(
     placed = to_host(placed)
     *_, target = placed.onwards()
     assert placed.tape is not None
+    # Jacobians of the flow from section to section, by which errors are propagated.
     with at_ease():
         J, _ = tape_jacobian(placed.structure(), placed.lanes, target, placed.tape)
     by_input = J[:, :, scale.shape[1] :]
     J = J[:, :, : scale.shape[1]]
     J[~placed.time_is_state, :, 0] = 0.0
+    # Errors (K, M, N, n) of all candidates; the reference is the last of the ways.
     ways = to_host(_try_ways(placed, settings, _kicks(placed, by_input, scale)))
     reference = ways.ends[:, -1:]
     error = np.moveaxis(ways.ends[:, :-1] - reference, 0, -1)
     if not placed.cycle.clocked:
         error[..., 0] = 0.0
 
+    # The candidate for each section.
     impacts = _impacts(ways, J, error, scale)
     largest = impacts.max(axis=1)
     _require_ways(largest)
@@ -230,7 +238,9 @@ class _Ways(NamedTuple):
     first: Float[Array, "K N"]
     """First steps of the candidates."""
     slack: Float[Array, " K"]
+    """As in `Plan`; infinite for candidates of equal steps."""
     lead: Float[Array, " N"]
+    """As in `Plan`."""
 
 
 def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]:
@@ -254,6 +264,8 @@ def _kicks(placed: PlacedSections, by_input, scale) -> Float[np.ndarray, "M nu"]
 def _try_ways(
     placed: PlacedSections, settings: Settings, kicks: Float[Array, "M nu"]
 ) -> _Ways:
+    """Run all candidates and the reference from every section to the next, on the cycle and under
+    the inputs `kicks`, in one call: a lane for each."""
     s = placed.structure()
     xp = namespace(placed.lanes.t)
     N = placed.n_sections

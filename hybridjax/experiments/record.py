@@ -2,10 +2,13 @@
 with gaps.
 
 Data of experiments and of recordings are made of such records (`HasRecords`). Fits to time series
-call `uninterrupted_records` to get records without unknown inputs. Gaps are NaN.
+call `uninterrupted_records` to get records without unknown inputs. Gaps are NaN. Fits rely on
+two conventions, which must stay: `y[i]` is sampled before `u[i]` acts, and sample i lies on section
+`first_section + i` (modulo N).
 
 If a fit uses fewer samples than expected, look at `_with_known_inputs`, which cuts records and
-leaves out outputs near a gap; if data are refused because outputs repeat, at `require_deviations`.
+leaves out outputs near a gap; if data are refused because outputs repeat, at `require_deviations`;
+if a part of a record has the wrong section, at `SectionSeries.part`.
 """
 
 import dataclasses
@@ -208,6 +211,8 @@ def require_deviations(records: Sequence[SectionSeries]) -> None:
 
 
 def _with_known_inputs(record: SectionSeries) -> Iterator[SectionSeries]:
+    """Yield the parts of a record in which all inputs are known. The last `lead` outputs of a part
+    may depend on inputs after it, and become NaN."""
     finite = np.isfinite(record.u).all(axis=1)
     edges = np.flatnonzero(np.diff(finite.astype(int), prepend=0, append=0))
     for first, stop in edges.reshape(-1, 2).tolist():

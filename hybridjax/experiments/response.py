@@ -4,7 +4,8 @@ program.
 `flow_batch` moves all experiments from section to section, each time by a search for events
 (`engine/move.py`), with the first steps of a plan (`plan.py`). Each experiment is a *lane*, an
 entry on the last axis of arrays. `run.py` calls it for experiments that leave the tables of
-`passage.py`. `response_function` is the same for users, with derivatives.
+`passage.py` or have none, and `fitting/observations.py` for fits. `response_function` is the same
+for users, with derivatives.
 
 Times and events are counted within one turn: only so is every turn computed alike, and `scan`
 compiles one move for all sections. Tests and error estimates have no derivatives (`fixed`,

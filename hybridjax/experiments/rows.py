@@ -9,8 +9,13 @@ writes the rows.
 In some experiments, an event near a section may happen on the other side of the section. Such an
 event has rows in both intervals. Each row moves only the experiments at its *place*, that is, after
 a certain section and a certain number of events. If an event turns out to lie beyond the next
-section, it is undone. An experiment that leaves its table without need has its cause in the signs
-that are expected (`Rows.signs`) or in the rows that are written (`_Writer._interval`).
+section, it is undone. A further column is a field of `Rows`, an argument of `_Writer._add`, and is
+read in `passage.py`. The order of rows must stay (events of an interval in turn, then the section),
+since a period is one pass over the rows.
+
+An experiment that leaves its table without need has its cause in the signs that are expected
+(`Rows.signs`) or in the rows that are written (`_Writer._interval`). If an event near a section has
+no row where it happens, look at `_intervals`; if steps have wrong lengths, at `_leg`.
 """
 
 import dataclasses
@@ -73,7 +78,7 @@ class Rows(NamedTuple):
     fixed: Float[np.ndarray, " R"]
     """Length of a step if Newton's guess is bad; 0 otherwise."""
     place: Int[np.ndarray, " R"]
-    """For an event: index of the transition among those of its kind."""
+    """For an event: index of the transition among those of its kind. (Not a place as in `at`.)"""
     may_wait: Bool[np.ndarray, " R"]
     """For an event: whether it may happen beyond the next section instead."""
     signs: Int[np.ndarray, "R G"]

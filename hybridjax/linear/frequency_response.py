@@ -2,7 +2,8 @@
 
 `LDTP.htf` calls `harmonic_transfer`, whose docstring has the formulas. The periodic states come
 from `_states`: a sum over one period, and a linear system for the state at its beginning. Where
-derivatives must come from the host, `_along` computes them by the same functions.
+derivatives must come from the host, `_along` computes them by the same functions. It has the
+derivatives of the formulas of `harmonic_transfer`, so that both must be changed together.
 `check_harmonics` says which harmonics exist, also for other files.
 
 If H is wrong at all harmonics, look at `_states`; if only derivatives that come from the host are,

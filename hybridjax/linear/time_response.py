@@ -1,4 +1,14 @@
-"""Time-domain computations with padded LDTP matrices, each compiled once per shape."""
+"""Time-domain computations with the padded matrices of an LDTP: responses, periodic states, and the
+product of all A[n].
+
+The methods of `LDTP` call them; cycles, sections and fits call `monodromy` and `periodic_states`,
+too. All of them rely on the zeros of the padding, and on the order of sections: A[n] leads from
+section n to n + 1, so that later factors stand on the left. Both must stay.
+
+If a response is wrong, look at `response`, and at `LDTP._response` for the section where it begins;
+if a periodic start leaves a transient, at `periodic_states`. The multipliers of an `LDTP` do not
+come from here: see `multipliers.py`.
+"""
 
 import functools
 
@@ -13,7 +23,8 @@ from .algebra import Matrices
 
 
 def monodromy(A: Float[Array, "N *S d d"]) -> Float[Array, "*S d d"]:
-    """The product `A[N-1] ... A[0]`."""
+    """The product `A[N-1] ... A[0]`, the padded monodromy matrix at section 0. (S are further
+    axes.)"""
     identity = namespace(A).eye(A.shape[-1], dtype=A.dtype)
     start = namespace(A).zeros_like(A[0]) + identity
     product, _ = scan(_multiplied, start, A)
@@ -38,7 +49,12 @@ def response(
     x0: Float[Array, " d"],
     sections: Int[Array, " n"],
 ) -> tuple[Float[Array, "time d"], Float[Array, "n ny"]]:
-    """`x0` and the states after each input, and the outputs; `sections`, where each input acts."""
+    """The states (`x0`, then those after each input), and the outputs at the sections where inputs
+    begin to act.
+
+    **Arguments:** `u`: inputs, one after the other. `sections`: the section at which each begins to
+    act.
+    """
 
     def advance(x, step):
         n, u = step
@@ -67,7 +83,8 @@ def impulse_response(m: Matrices, n_lags: int) -> Float[Array, "N lags ny nu"]:
 def periodic_states(
     A: Float[Array, "N d d"], B: Float[Array, "N d nu"], u: Float[Array, "S P N nu"]
 ) -> Float[Array, "S d"]:
-    r"""The starts of responses with period $P N$: $x_{p+1} = \Phi x_p + w_p$, $x_P = x_0$.
+    r"""The states at section 0 from which responses to S inputs that repeat after P periods are
+    periodic: $x_{p+1} = \Phi x_p + w_p$ with $x_P = x_0$.
 
     Solved by a Fourier transform over the periods $p$, since in $(I - \Phi^P)^{-1}$ the unstable
     part of an unstable system would drown the stable one.

@@ -1,9 +1,13 @@
 """The flow along a cycle to one section after the other, from recorded steps, on the host.
 
 `locate.py` calls `flow_along`. The *moves* of the cycle (its recorded steps, with the events at
-their ends) are cut where a section lies within them, without another search. If a section is found
-in the wrong place, look at `_levels_met` (in which move it lies) and `_until_settled` (where in the
-move).
+their ends) are cut where a section lies within them, without another search. In doubt `flow_along`
+returns None, and `locate.py` searches: this must stay so. (`_Walk` here is a list of moves, and has
+nothing to do with `walk.py`.)
+
+If a section is found in the wrong place, look at `_levels_met` (in which move it lies) and
+`_until_settled` (where in the move); if an event after a section is missed or repeated, at
+`_ends_at_targets` (armed guards); if there is a search without need, at the cases of None.
 """
 
 import dataclasses
@@ -46,6 +50,7 @@ def flow_along(
     places = _places_on(map, moves, before, begin, targets)
     if places is None:
         return None
+    # Moves from target to target, and by what each ends.
     walk = _walk(map, moves, begin, places)
     by_clock = np.isfinite(targets.time[0])
     arrival = ARRIVE_TIME if by_clock else ARRIVE_LEVEL
@@ -63,6 +68,7 @@ def flow_along(
     at_once = happens & (h == 0)
     if (at_event | at_once | (h < 0)).any():
         return None
+    # Lanes at the beginning and the end of each piece.
     chart = moves.chart[walk.key]
     ends = _ends_at_targets(map, walk, chart, code, begin.events)
     begins = []
@@ -70,6 +76,7 @@ def flow_along(
         begins.append(np.append(first, others[..., :-1], axis=-1))
     pieces = Lanes(*begins)
 
+    # The recorded steps of each piece.
     M = before.shape[1]
     after = walk.q[:, 1:]
     rows = Tape(
@@ -144,6 +151,7 @@ class _Walk(NamedTuple):
 
 
 def _walk(map: ReturnMap, moves: Moves, begin: Lanes, places: _Places) -> _Walk:
+    """The starts of moves from the beginning of the flow to the last target, in order of time."""
     late = places.t - moves.t[places.key]
     is_replaced = late <= TOGETHER * map.expected
     first = places.first[0]
@@ -241,7 +249,7 @@ def _places_on(
 
 def _levels_met(s: Structure, once: Moves, ends, targets: Target, event, lengths):
     """For each target, the move in which it lies, and the time from the start of the move to the
-    target, to first order. None if a target is not met exactly once."""
+    target, to first order; both (K,). None if a target is not met exactly once."""
     K = len(targets.time)
     start, end = _levels_on(s, once, ends, targets)
     falls = (start > 0) & (end <= 0)

@@ -5,8 +5,10 @@ cycle misses, touches, crosses twice or meets in another order. The text of the 
 at which the section would be crossed once (`_remedy`). A *level* is a function that falls through
 zero at its section.
 
-If a good section is refused, look at the constants, and at the function that `check_placed` calls
-for this error; if the remedy names wrong values, at `_met`.
+The order of the tests must stay: later ones take for granted what earlier ones have tested. If a
+good section is refused, look at the constants, and at the function that `check_placed` calls for
+this error; if the remedy names wrong values, at `_met`; if a section that is crossed twice is
+accepted, at `_levels_along`.
 """
 
 from typing import NamedTuple
@@ -60,7 +62,8 @@ class OutOfOrderError(ComputationError):
 
 def check_placed(placed: PlacedSections, first: int) -> None:
     """**Raises:** `ComputationError` for the first section that is missed, tangent, out of order,
-    crossed twice, or by the clock at the time of an event."""
+    crossed twice, or by the clock at the time of an event. `first`: the `Result` of the flow to
+    section 0."""
     _require_reached(placed, [first, *np.asarray(placed.result).tolist()])
     name = placed.family.describe
     anchor = placed.family.anchor

@@ -9,7 +9,8 @@ cycle (`_on_walk`, see `walk.py`); and in a program, by a search (`_searched`). 
 outputs are in `Delayed`.
 
 If one way differs from the others, look at its function; if all matrices are wrong, at
-`PlacedSections.frames`; if only C and D are, at `_output_jacobians`.
+`PlacedSections.frames`; if only C and D are, at `_output_jacobians`; if only models with a delay
+are, at `Delayed.of`.
 """
 
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -109,6 +110,7 @@ def linearize(
     cycle.require_found()
     s = cycle.structure
     traced = is_traced(cycle, sections)
+    # (A family is placed later if JAX traces it or the cycle; `placed` is then still the family.)
     of_family = traced and not isinstance(sections, PlacedSections)
     placed: Any = sections if of_family else as_placed(cycle, sections)
     z = check_outputs(cycle, s.states_everywhere() if outputs is None else outputs)
@@ -116,6 +118,7 @@ def linearize(
         *(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist())
     )
     names, columns = s.inputs_among(inputs)
+    # One of the three ways.
     family = as_family(placed) if of_family else None
     walk = None if family is None else walk_beside(cycle, family)
     if family is not None and walk is not None:

@@ -4,10 +4,11 @@
 `place_in_program` (inside), and gets `PlacedSections`. `_place` does the work: it binds the family
 to the cycle (`_bind`), flows to section 0, and then from each section to the next. On the host, the
 recorded steps of the cycle are used if they are known (`along.py`); otherwise there is a search.
-Results are checked in `checks.py`.
+Both must give the same. Results are checked in `checks.py`.
 
 If a section is placed at a wrong time, look at `_bind` (clock sections), and at `along.py` or the
-search (others); if the order is wrong, at `place_in_order`.
+search (others); if the order is wrong, at `place_in_order`; if a good section is refused, at
+`checks.py`, or for a clock section at an event, at `_near_events`.
 """
 
 import dataclasses
@@ -54,6 +55,7 @@ _sorted = Recent(4)
 
 
 def _patient(cycle: LimitCycle) -> ReturnMap:
+    """The return map of a cycle, with at least `PATIENCE` steps from section to section."""
     map = cycle.return_map
     steps = max(map.settings.max_steps, PATIENCE)
     return dataclasses.replace(
@@ -134,6 +136,8 @@ def _locate(
     xp = namespace(period)
 
     def go(carry, targets, patience=np.inf):
+        """Flow to the targets one after the other, from recorded steps or by a search; in the form
+        that `through` returns."""
         found = None
         if turn is not None and on_host(period):
             found = flow_along(map, turn, carry, targets)
@@ -145,6 +149,7 @@ def _locate(
         flows.append((flow[0], targets, flow[2]))
         return carry, flow
 
+    # From the beginning of the cycle to the anchor.
     first_step = stride((0.1 * period / N)[None])
     carry = map.anchor, first_step, xp.zeros(1, xp.int32)
     before = None
@@ -154,6 +159,8 @@ def _locate(
         carry, before = go(carry, to_section(target, family.anchor))
         if not family.at_anchor:
             before = None
+    # From the anchor to all sections. (The first piece leads to section 0, unless that is the
+    # anchor.)
     bound = _bind(s, map, family, carry[0], go)
     targets = _all_sections(bound, period, begins_on_section=before is not None)
     _, pieces = go(carry, targets, 1.5 * period)
@@ -161,6 +168,7 @@ def _locate(
         before = pieces
         pieces = jax.tree_util.tree_map(lambda x: x[1:], pieces)
     first = before[1].result[0, 0]
+    # Result codes of the flow from each section to the next.
     lanes, moved, tape = side_by_side(pieces)
     duration = moved.lanes.t - lanes.t
     near = _near_events(map, bound, lanes, moved.lanes, tape)
@@ -170,7 +178,7 @@ def _locate(
     still = xp.zeros((s.nu, 1))
     missed = followed_at_once(s, lanes, still, bound.event >= 0, period)
     result = xp.where(missed >= 0, xp.int32(Result.EVENT_ORDER), result)
-    if not on_host(period):  # (on the host `_check` says more)
+    if not on_host(period):  # (on the host `check_placed` says more)
         turns = xp.abs(xp.sum(duration) / period - 1) > SAME
         result = update_result(result, turns, Result.SECTION_MISSED)
     coordinates = coordinates_on(map, bound, lanes)

@@ -2,10 +2,13 @@
 
 `section_map` returns a `SectionMap`, which users call with a state on section i. It flows to
 section j (`_arrivals`) and returns an `Arrival`. `plot/returns.py` calls `arrivals` for many states
-at once.
+at once. A state that does not arrive, or arrives otherwise than the cycle, has a `Result` code and
+NaN: `SectionMap.__call__` turns the code into an error, and programs of JAX get both. This must
+stay so.
 
 If a map is wrong, compare it with `linearize` at the cycle; if a state does not arrive, look at
-`_PATIENCE` and at the search.
+`_PATIENCE` and at the search; if `EVENT_ORDER` is reported without need, at the last lines of
+`_arrivals`.
 """
 
 import dataclasses
@@ -176,7 +179,8 @@ def _map(map: SectionMap, q, u, t) -> Arrival:
 
 
 def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
-    """Arrivals of lanes from states (n, L) under inputs (nu, L) at times (L,)."""
+    """Arrivals of L lanes from states q (n_i, L) on section i at times t (L,), under inputs u
+    (nu, L), within `patience` periods."""
     placed = map.placed
     i = map.i
     j = map.j
@@ -185,11 +189,13 @@ def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
     lanes = placed.lanes
     n, count = q.shape
     q = put(xp.zeros((s.d, count)), slice(n), q)
+    # The chart and the armed guards are those of the cycle.
     start = jax.tree_util.tree_map(
         lambda x: xp.broadcast_to(x[..., i : i + 1], (*x.shape[:-1], count)), lanes
     )
     start = start._replace(t=t, q=q)
     turns = 1 if j <= i else 0
+    # The flow to section j.
     target = placed.target(xp.full(count, j), t, xp.full(count, turns))
     late = target.limit + patience * placed.cycle.period
     # (The time of a clock section is the limit.)
@@ -197,6 +203,7 @@ def _arrivals(map: SectionMap, q, u, t, patience) -> Arrival:
     target = dataclasses.replace(target, limit=limit)
     moved = move(s, start, u, target, placed.cycle.settings).moved
     end = moved.lanes
+    # Tests: the chart at the end, and events that follow at once on section i or j.
     result = update_result(
         moved.result, end.chart != lanes.chart[j], Result.EVENT_ORDER
     )

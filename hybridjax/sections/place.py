@@ -5,8 +5,12 @@ they are located along the recorded itinerary of a known cycle if there is one (
 `place_along` computes derivatives of placed sections on the host, for `linearize`. `observed_at`
 gives only the times of sections and the outputs, for fits.
 
+All of these ways must agree. A `turn` is the recorded steps of the last period of the cycle
+(`last_turn`).
+
 If sections lie at wrong places, look at `locate.py`; if only their derivatives are wrong, at
-`place_along` (host) or `walk.py` (programs), which must agree.
+`place_along` (host) or `walk.py` (programs); if sections of another cycle are accepted or refused,
+at `as_placed`.
 """
 
 import dataclasses
@@ -119,7 +123,13 @@ def place_along(
 ) -> tuple[PlacedSections, kernels.Tangents, np.ndarray]:
     """Derivatives of placed sections in P directions, on the host. Returns N P sections as complex
     numbers, whose imaginary parts are derivatives (see `kernels.Tangents`); the structure; and the
-    Jacobians (N, P, n, m) of the flow from section to section."""
+    Jacobians (N, P, n, m) of the flow from section to section.
+
+    **Arguments:** `by_cycle`, `by_family`: the directions, as derivatives of the cycle and of the
+    family, with an axis of length P in front.
+
+    **Raises:** `NotOnHostError` if the flow does not reach a section.
+    """
     placed, flows = place_by_turn(cycle, family, turn)
     N = family.n_sections
     if np.any(placed.result):
@@ -209,6 +219,7 @@ def _moved_times(
 def _observed(
     cycle: LimitCycle, family: AbstractSections, outputs: tuple[str, ...], _: Any
 ):
+    """`observed_at` by `place_sections`."""
     placed = place_sections(cycle, family)
     return placed.lanes.t, placed.observe(outputs) if outputs else None
 

@@ -2,9 +2,14 @@
 
 They have the time, chart and state of the cycle at each section, and the coordinates on it.
 `linearize` asks for the Jacobians from section to section (`flow_jacobians`, `between`),
-experiments for the targets of the flow (`onwards`) and for outputs (`observe`). `frames` relates
-coordinates on a section to deviations of time and state: if matrices of `linearize` are wrong and
-the flow is right, look there.
+experiments for the targets of the flow (`onwards`) and for outputs (`observe`). Three things must
+stay: the order of the fields, in which `locate.py` and `walk.py` pass them; the order (t, q, u) of
+deviations; and that `lanes` lie in one period from section 0.
+
+`frames` relates coordinates on a section to deviations of time and state: if matrices of
+`linearize` are wrong and the flow is right, look there. If a flow stops before a section that it
+would reach, look at the limit in `section_target`; if an event at a section is missed, at
+`followed_at_once`.
 """
 
 from typing import TypeAlias

@@ -2,8 +2,12 @@
 
 `hj.designs` calls `second_order` and asks the `Quadratic` for the nonlinear distortion of second
 order that inputs cause: `Quadratic.second_order` for given inputs, `products` for all pairs of
-cosines. A wrong distortion has its cause in `_derivatives`, which differentiates the flow from
-section to section twice, or in `_pairs`.
+cosines. Deviations have the order (t, q, u) everywhere: n = 1 + d numbers of time and state, and
+then the inputs. This must stay so.
+
+If both distortions are wrong, look at `_derivatives`, which differentiates the flow from section to
+section twice; if only that of pairs is, at `_pairs` and `_steady`; if only expected values are, at
+the factors in `Products`.
 """
 
 from typing import NamedTuple
@@ -32,7 +36,8 @@ _NUMBERS = 2**21
 
 
 class Quadratic(NamedTuple):
-    """Derivatives with respect to the m deviations of states and inputs at each of N sections."""
+    """Derivatives with respect to the m deviations (n of time and state, then those of inputs) at
+    each of N sections."""
 
     step: Float[np.ndarray, "N n m"]
     """First derivatives of the states at the next section."""
@@ -41,6 +46,7 @@ class Quadratic(NamedTuple):
     show: Float[np.ndarray, "N ny m"]
     """First derivatives of the outputs."""
     show_bend: Float[np.ndarray, "N ny m m"]
+    """Second derivatives of the outputs."""
 
     @property
     def _states(self) -> Float[np.ndarray, "N n n"]:
@@ -183,6 +189,7 @@ class Products(NamedTuple):
     sum: Float[np.ndarray, "ny K K"]
     """Mean squares over the sections of the response at the sum of the two frequencies."""
     difference: Float[np.ndarray, "ny K K"]
+    """The same at the difference of the two frequencies."""
     mean: Float[np.ndarray, "ny N K"]
     """The response to the pair of a cosine with itself, at the difference of frequencies, which is
     zero."""

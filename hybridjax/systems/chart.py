@@ -2,7 +2,9 @@
 
 Users subclass `Chart`; `FieldChart` makes a chart from a function, and `DerivedChart` changes parts
 of another chart. The engine reads charts through `structure.py`. The names of attributes are public
-and must not change. If a chart of a user is refused, look at `Chart.__new__` and `_require_names`.
+and must not change; a further attribute needs a line in `DerivedChart`, too, and in
+`_parts_of_chart` (`system.py`), which notices changes. If a chart of a user is refused, look at
+`Chart.__new__` and `_require_names`; if a derived chart lacks an attribute, at `DerivedChart`.
 """
 
 import abc

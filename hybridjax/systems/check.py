@@ -9,7 +9,9 @@ the traced program whether a function uses the time.
 If a good system is refused, its error leads to the check: shapes to `_check_shape`, names to
 `_check_names` and `_check_all_names`, schedules to `check_schedules`, charts and transitions to
 `_check_definition`. If a dependence on the time is missed or invented, look at `_dependence`; if an
-error of the user's code gets the wrong advice, at `_problem`.
+error of the user's code gets the wrong advice, at `_problem`. A further check is called in
+`_check_functions`. It must not depend on values of parameters: a system that differs from one that
+has passed in such values alone is not checked again (`_passed`).
 """
 
 import contextlib

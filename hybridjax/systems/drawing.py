@@ -1,7 +1,13 @@
 """`Drawing`: what a system looks like in one state, for animations. It has shapes by name, without
 matplotlib.
 
-`HybridSystem.draw` returns it; `hj.plot.animate` reads it.
+`HybridSystem.draw` returns it. `plot/pictures.py` evaluates it for many states, and
+`plot/motion.py` draws it for `hj.plot.animate`. A further kind of shape is a field made by
+`_shapes` here, and a loop in `_picture` of `plot/motion.py`. Rows of a shape must begin with (x,
+y): pictures are moved by these.
+
+If a drawing is refused, look at `_array` and `_shapes`; if a picture jumps at events or stands
+still, at `body` and `velocity`, which `plot/pictures.py` uses to place it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,6 +24,10 @@ from ..errors import DefinitionError
 
 
 def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
+    """An array of numbers of this shape; `None` stands for any length.
+
+    **Raises:** `DefinitionError` for something else.
+    """
     try:
         array = jnp.asarray(value, float)
     except (TypeError, ValueError):
@@ -35,7 +45,7 @@ def _array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
 
 
 def _shapes(*shape: int | None, **options: Any) -> Any:
-    """A field of shapes by name."""
+    """A field of arrays by name, each of this shape (as in `_array`)."""
 
     def arrays(shapes: Mapping[str, Any]) -> dict[str, Any]:
         named = isinstance(shapes, Mapping) and all(isinstance(x, str) for x in shapes)

@@ -3,8 +3,11 @@ package.
 
 `as_method` converts any of these to a `Method`: the coefficients, in the form that
 `engine/runge_kutta.py` uses. `solvers` checks what a user gives for a system (one solver, or one
-for each chart). If a solver is refused, look at the conditions in `_as_method`; if its errors are
-of the wrong order, at its coefficients (`_from_tableau`, `_radau`) and at `Method.order`.
+for each chart). A further kind of solver is a case in `_as_method`. A `Method` must hold tuples,
+numbers and text only: solvers are compared and hashed.
+
+If a solver is refused, look at the conditions in `_as_method`; if its errors are of the wrong
+order, at its coefficients (`_from_tableau`, `_radau`) and at `Method.order`.
 """
 
 import functools as ft
@@ -155,6 +158,10 @@ def _no_solver(given: Any) -> DefinitionError:
 
 
 def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) -> Method:
+    """The method of a tableau of diffrax, which lists the lower triangle without its first row.
+
+    **Raises:** `DefinitionError` for an implicit first stage.
+    """
     a = np.zeros((tableau.num_stages, tableau.num_stages))
     for k, row in enumerate(tableau.a_lower):
         a[k + 1, : k + 1] = row
@@ -168,12 +175,14 @@ def _from_tableau(name: str, tableau: "diffrax.ButcherTableau", order: float) ->
 
 
 def _method(name: str, a, b, c, error, order: float, **controls: Any) -> Method:
+    """A method from arrays of coefficients."""
     rows = tuple(tuple(map(float, row)) for row in a)
     b, c, error = (tuple(map(float, x)) for x in (b, c, error))
     return Method(name, rows, b, c, error, order, **controls)
 
 
 def _radau(s: int) -> Method:
+    """The method of `Radau` with s implicit stages, behind an explicit first stage of weight 0."""
     from scipy import special
 
     # The Radau points are 1 and zeros of a Jacobi polynomial.

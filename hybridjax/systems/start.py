@@ -1,4 +1,13 @@
-"""What moves, and where it begins, as users give it: a system or its field, a state or a guess."""
+"""What moves, and where it begins, as users give it: a system or its field, a state or a guess.
+
+`hj.simulate`, `hj.flow` and `hj.find_limit_cycle` call `system_of`, and `guess_of` for a given
+start; `own_guess` has that of the model. A further form of a system or a start is a word in
+`SystemLike` or `StateLike`, and a case in one of these functions. A state that knows its time must
+begin there: at time 0 it would leave the cycle of a system with a clock.
+
+If a function is refused as a field, look at `_is_field` and `_require_arguments`; if a state is
+taken for one of another chart, at `_fits` and `guess_of`.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeAlias
@@ -14,6 +23,7 @@ from .system import Guess, HybridSystem, name_of, taken_by_position
 
 
 def _is_field(value: Any) -> bool:
+    """Test whether a value is a function of the user: no class, and nothing of this package."""
     of_package = type(value).__module__.partition(".")[0] == __name__.partition(".")[0]
     return callable(value) and not isinstance(value, type) and not of_package
 
@@ -132,6 +142,7 @@ def own_guess(system: HybridSystem) -> Guess:
 
 
 def _fits(s: Structure, a: int, state: StateLike) -> bool:
+    """Test whether a state has the names, or else the number, of the states of chart a."""
     states = s.charts[a].states
     if isinstance(state, Mapping):
         return set(state) == set(map(str, states))

@@ -2,13 +2,18 @@
 form.
 
 The engine evaluates a system only through its `Structure`. Functions take (t, q, u) and return
-arrays, and guards are signed so that they fall through zero at their event. A wrong sign of a guard
-or a wrong index of a transition has its cause here.
+arrays, and guards are signed so that they fall through zero at their event. Indices follow the
+order in which the system lists charts and transitions. Both must stay: recorded steps and all
+searches rely on them. `Varied` (`varied.py`) replaces `field`, `guard` and `reset`.
 
 Transitions that are written once and differ only in a number are of one *kind*. For example, in
 `[Transition(..., guard=Contact(self, i), ...) for i in range(n)]`, the number `i` becomes an
 argument of one function, so that n contacts are traced, compiled and evaluated as one. `kinds`
 finds them.
+
+If a guard has a wrong sign, look at `Structure.guard`; if an input acts in the wrong chart, at
+`chart_input`; if transitions that are alike compile one by one, at `_form` and `_is_one`; if a tick
+of a clock leads to two events or to none, at `clocks`; if an output is NaN, at `Outputs._function`.
 """
 
 import dataclasses

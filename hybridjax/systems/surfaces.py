@@ -3,9 +3,11 @@ point towards the surface.
 
 `filippov` returns the charts (two sides, and a `SlidingChart`) and the transitions between them.
 The field of sliding is the combination of both fields that is tangent to the surface
-(`SlidingChart.field`). If a state slides that should cross, or the reverse, look at the conditions
-`held` and `borne`, and at the signs of `SlidingChart.rates`; if pushes have a wrong effect, at
-`SlidingChart.returned`.
+(`SlidingChart.field`). The order must stay: the first chart is above the surface, and `rates` has
+its rate first.
+
+If a state slides that should cross, or the reverse, look at the conditions `held` and `borne`, and
+at the signs of `SlidingChart.rates`; if pushes have a wrong effect, at `SlidingChart.returned`.
 
 A. F. Filippov, Differential Equations with Discontinuous Righthand Sides, 1988; V. I. Utkin,
 Sliding Modes in Control and Optimization, 1992.
@@ -128,10 +130,12 @@ class SlidingChart(DerivedChart):
     surface: Callable[[Any, Any], Any]
 
     def fields(self, t, q, u):
+        """The fields (n,) above and below."""
         return [as_vector(chart.field(t, q, u)) for chart in (self.chart, self.below)]
 
     def rates(self, t, q, u):
-        """Rates of the surface's function along both fields."""
+        """Rates of the surface's function along the fields above and below: a and b of
+        `filippov`."""
         t = jnp.asarray(t, float)
         q = jnp.asarray(q, float)
 

@@ -5,10 +5,13 @@ With it are `Output`, `parameter` and `Guess`. `Derived` changes parts of anothe
 `Driven` adds an input that is a function of time. The engine reads systems through `structure.py`;
 a system is checked in `check.py`.
 
-Names of attributes and methods are public and must not change. If a parameter has a wrong type or
-loses its derivative, look at `parameter` and `_number`; if a system from `from_functions` calls its
-functions wrongly, at `taken_by_position` and `_with_parameters`; if a stored result is not
-recognized, at `describe`.
+Names of attributes and methods are public and must not change. A further method on which results
+depend needs a `Part` at the end of this file: otherwise changes of its code may go unnoticed
+(`_core/meaning.py`).
+
+If a parameter has a wrong type or loses its derivative, look at `parameter` and `_number`; if a
+system from `from_functions` calls its functions wrongly, at `taken_by_position` and
+`_with_parameters`; if a stored result is not recognized, at `describe`.
 """
 
 import abc

@@ -2,7 +2,11 @@
 (`Scheduled`), with a reset.
 
 Users make transitions; the engine reads them through `structure.py`. The two constants of the file
-say when two times are the same.
+say when two times are the same. Names of fields are public and must not change. A `guard` is as the
+user wrote it: the engine gets the one that falls at its event from `Structure.guard`.
+
+If an event happens twice, or not at all after a reset, look at `rearm` in `engine/events.py`; if a
+scheduled event comes at a wrong time, at `next_schedule` there and at `Scheduled.nearest`.
 """
 
 from collections.abc import Callable

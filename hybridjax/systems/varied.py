@@ -2,6 +2,12 @@
 
 `Varied` is a structure whose single input is added to a parameter: derivatives by this input are
 derivatives by the parameter. Sensitivities and continuation use it.
+
+Fields, guards and resets are evaluated at the changed parameter here, by `_under`; periods,
+outputs, schedules and levels of sections in `engine/kernels.py`, by `Structure.under`. A further
+function with derivatives by parameters needs the one or the other. If a derivative lacks a part,
+look at these two; if a parameter is not found, at `parameters_of` in `system.py`, which lists
+single floating-point numbers only.
 """
 
 import operator
@@ -40,6 +46,9 @@ def with_parameters(system: HybridSystem, values: Mapping[str, Any]) -> HybridSy
 
 
 def _under(name: str) -> Any:
+    """The method of that name of the structure `under` an input: a function (x, t, q, u) of a chart
+    or transition x."""
+
     def function(self, x, t, q, u):
         s = self.under(u)
         return getattr(s, name)(x, t, q, jnp.zeros(s.nu))
@@ -69,5 +78,6 @@ class Varied(Structure):
         return cls(children[0], parameter)
 
     def under(self, u: Array) -> Structure:
+        """The structure whose parameter is larger by the input u (1,)."""
         value = parameter_of(self.system, self.parameter) + u[0]
         return Structure(with_parameters(self.system, {self.parameter: value}))

@@ -1,7 +1,12 @@
 """Phases of multisines that give low crest factors (largest value over rms value).
 
 `Design.optimize_phases` calls `low_peak_phases`, which minimizes p-norms of each signal over its
-phases, for growing p.
+phases, for growing p. Phases that other rules need are no unknowns (`free`): those of lines that
+several experiments share, and those at 0 and N/2. The signal is made as in `Design.signals`: the
+two must agree.
+
+If crest factors are not low, look at the constants; if the minimization fails, at the derivatives
+in `norm`; if a design is refused afterwards, at `free`.
 """
 
 from typing import Any
@@ -48,7 +53,11 @@ def low_peak_phases(design: Any, seed: int) -> Float[np.ndarray, " K"]:
 
 
 def _lower(phase, free, line, size, length: int):
-    """Return the free phases of one signal that minimize its peak."""
+    """Return the free phases of one signal that minimize its peak.
+
+    **Arguments:** one entry for each cosine of the signal: `phase`, whether it is `free`, its
+    `line`, and its `size` in the spectrum. `length`: number of samples.
+    """
     from scipy.optimize import minimize  # (a third of a second, needed by few designs)
 
     spectrum = np.zeros(length // 2 + 1, complex)

@@ -1,4 +1,10 @@
-"""`random_input`: noise with power up to a frequency, for any hardware that plays a file."""
+"""`random_input`: noise with power up to a frequency, for any hardware that plays a file.
+
+Users call it, and no other part of the package does. The filter must run forwards and backwards:
+only so is half of the amplitude left at `bandwidth`. If the signal has a transient at its ends,
+look at the samples that are cut off there (`transient`); if its rms value is wrong, at the last
+line.
+"""
 
 import numpy as np
 from jaxtyping import Float

@@ -5,7 +5,8 @@ Both divide the lines of a band among experiments (`partition.py`), give them ra
 return a `Design`. A *line* is the integer j of a frequency j / P in cycles per period. If a
 frequency is missing, look at `_lines`; if the number of experiments is wrong, at `_number`; if
 inputs cannot be told apart, at `_orthogonal`. A further choice of lines or division is a word in
-its type, a case in the function that uses it, and a rule in `_check_choices`.
+its type, a case in the function that uses it, and a rule in `_check_choices`. Random numbers must
+be drawn in the same order as now: otherwise a seed gives another design than before.
 """
 
 from collections.abc import Callable
@@ -206,7 +207,12 @@ def _lines(n_sections: int, periods: int, band: Band, lines: Lines) -> np.ndarra
 
 def _orthogonal(division, j, phase):
     """Return every set of lines in nu experiments. From one of these to the next, phases of the
-    inputs change by multiples of 2 pi / nu, which separates the responses to the inputs."""
+    inputs change by multiples of 2 pi / nu, which separates the responses to the inputs.
+
+    **Arguments:** `division` (K,): the set of each line j (K,). `phase` (nu, K): of each input.
+
+    **Returns:** experiment, line, input and phase of each of nu * nu * K cosines.
+    """
     nu, K = phase.shape
     block, k, channel = np.indices((nu, K, nu)).reshape(3, -1)
     turned = phase[channel, k] + 2 * np.pi / nu * block * channel

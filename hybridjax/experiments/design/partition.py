@@ -12,8 +12,8 @@ exactly if their classes are equal. Lines of one class need one experiment each,
 different classes never disturb each other. So the size of the largest class is the smallest
 possible number of experiments, and every greater number works, too.
 
-`assign` makes a random division of lines that obeys this rule, and `avoid_second_order` also avoids
-the frequencies of second-order distortion.
+These rules follow from the theory and are no settings. `assign` makes a random division of lines
+that obeys them, and `avoid_second_order` also avoids the frequencies of second-order distortion.
 
 If a good design is refused, look at `line_class` and `check_sharing`; if second-order products are
 left on lines, at `_anneal`, whose rounds are limited.
