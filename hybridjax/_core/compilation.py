@@ -374,6 +374,8 @@ def _run_lanes(
     *arguments,
     some=None,
 ) -> np.ndarray:
+    """The results of a kernel for arguments of any number L of lanes, in blocks of `lanes`; `some`
+    is a mask (L,), see `kernel`."""
     if some is not None:
         needed = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
         values = _run_lanes(program, arrays, lanes, *needed)

@@ -102,6 +102,7 @@ def _require_values(reading: Reading) -> None:
 
 
 def _mark(x: Any, digest: str) -> Any:
+    """Return a copy of a definition with this digest as its `code_digest`."""
     leaves, structure = jax.tree_util.tree_flatten(x)
     marked = jax.tree_util.tree_unflatten(structure, leaves)
     object.__setattr__(marked, "code_digest", digest)

@@ -611,6 +611,8 @@ def _imported(name: str, level: int, space: dict[str, Any]) -> types.ModuleType 
 
 @ft.lru_cache(4096)
 def _code(code: types.CodeType) -> str:
+    """Return the digest of code, of the names in it and of its constants, but not of its lines and
+    file."""
     names = (code.co_names, code.co_varnames, code.co_freevars)
     counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
     return Reading(code.co_code, *names, *counts, *code.co_consts).digest
@@ -636,6 +638,8 @@ _READING_ATTRIBUTES = frozenset(
 
 @ft.lru_cache(4096)
 def _names(code: types.CodeType) -> _Names:
+    """Return what code names, from its instructions: a path goes on as long as each next
+    instruction reads an attribute."""
     paths: list[Names] = []
     imports: list[tuple[str, int]] = []
     attributes: list[str] = []
