@@ -120,6 +120,7 @@ class _Field(NamedTuple):
 
 
 def _fields_of(kind: type) -> list[_Field]:
+    """Return the fields of a module or of a named tuple, whose `bool` fields count as static."""
     if issubclass(kind, tuple):
         hints = typing.get_type_hints(kind)
         return [
@@ -265,6 +266,11 @@ def _item_of(hint: Any) -> type | None:
 def _read_header(
     path: Path, array: np.ndarray | None, kinds: Mapping[str, type]
 ) -> dict[str, Any]:
+    """Return the header in the array `header` of a file.
+
+    **Raises:** `FileFormatError` if there is none, if it is of another format or version or of a
+    kind that is not among `kinds`, or if parts are missing.
+    """
     try:
         if array is None or array.nbytes > limits.TEXT:
             raise ValueError
@@ -333,6 +339,8 @@ def _wrong_field(thing: eqx.Module | tuple) -> str | None:
 
 
 def _matches(value: Any, hint: Any) -> bool:
+    """Return whether a value is what an annotation says, of the forms that annotations of fields
+    have."""
     origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
     if origin is typing.Annotated:
@@ -388,6 +396,8 @@ def damaged(path: Path, reason: str) -> FileFormatError:
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
+    """**Raises:** `ValueError` if arrays are larger than a file of `packed` bytes may hold, or two
+    have one name."""
     size = sum(m.file_size for m in members)
     most = limits.unpacked(packed)
     if size > most:
@@ -399,6 +409,10 @@ def _check_sizes(members: list[zipfile.ZipInfo], packed: int) -> None:
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """Read an array, after its header was found to declare as many bytes as there are.
+
+    **Raises:** `ValueError` for Python objects, and for another size.
+    """
     with archive.open(member) as stream:
         major, minor = np.lib.format.read_magic(stream)
         read_header = getattr(np.lib.format, f"read_array_header_{major}_{minor}")

@@ -4,6 +4,9 @@ objects belong to the same system.
 Called by public functions whose arguments depend on each other (an index and a count, names and the
 system that has them). Each function raises the sentence that a user reads. If a name is not
 suggested, look at `spelling.py`. Types of single arguments are checked earlier, in `boundary/`.
+
+Names by default (`_LETTERS`) must stay, since users' scripts and files have them. If the message
+about a library that is missing names a wrong extra, add a line to `_EXTRAS`.
 """
 
 import importlib

@@ -4,6 +4,11 @@ between processes.
 JAX loads machine code from the folder and runs it unchecked, so nobody but the user may be able to
 write there. The functions here make the folder and check its permissions. The command line and
 workers of Dask call them too.
+
+No check may be dropped. If a folder is refused without need, look at `_refuse_others` (who may
+write to it, and to those above it), then at the end of `_private_folder` (a copy, or files that are
+no programs); if programs are compiled again in each process, at `keep_programs_in` in
+`jax_compat.py`.
 """
 
 import os

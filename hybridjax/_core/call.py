@@ -2,6 +2,14 @@
 
 Whether the user's code has changed is looked at once in a public call, and functions of the user
 that are no part of a program (`charts`, `transitions`) are called once.
+
+`boundary/checked.py` opens a `public_call`; others keep values by `once_in_call`. A call is known
+by the frame of the user's line: this must stay so, since a user's function that runs in between may
+change values, and has its own frame. Models of this package count as code of the user.
+
+If a change in the user's code is not noticed, look whether `public_call` takes two calls for one;
+if charts are made again and again, at the conditions in `once_in_call` and at its `key`; if a
+warning names another line than the user's, at `_frame_of_user`.
 """
 
 import collections

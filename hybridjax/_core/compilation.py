@@ -9,9 +9,11 @@ each array; the host is this process's Python with NumPy, in place of a compiled
 - `kernel` compiles single functions of users for code that runs on the host; `whole` programs that
   do more at once.
 
-Options change the time, and results by rounding only. If a program is compiled again without need,
-look at `kind` and `identity`, by which programs are found again; if a function stays slow, at
-`WORTH_COMPILING` in `host_first`.
+Options change the time, and results by rounding only: this must stay so, as must `in_turn`, without
+which two programs may wait for each other for ever. If a program is compiled again without need, or
+one is run that was compiled for something else, look at `kind` and `identity`, by which programs
+are found again; if a function stays slow, at `WORTH_COMPILING` in `host_first`; if threads wait for
+ever, at `alone` and `_calls_lapack`.
 """
 
 import collections
@@ -41,8 +43,8 @@ from .progress import say_compiling
 # Seconds of host time after which a function is compiled, which takes about as long. Less: programs
 # are compiled that are not used again. More: repeated calls stay slow for longer.
 WORTH_COMPILING = 6.0
-# Programs of either kind that are kept. Fewer: calls that alternate between many systems compile
-# again.
+# Programs that are kept of `Program`, and as many of `kernel` and `whole`. Fewer: calls that
+# alternate between many systems compile again.
 _KEPT = 1024
 
 
@@ -372,6 +374,8 @@ def _run_lanes(
     *arguments,
     some=None,
 ) -> np.ndarray:
+    """The results of a kernel for arguments of any number L of lanes, in blocks of `lanes`; `some`
+    is a mask (L,), see `kernel`."""
     if some is not None:
         needed = [x[..., some] if x.shape[-1] == len(some) else x for x in arguments]
         values = _run_lanes(program, arrays, lanes, *needed)
@@ -427,7 +431,8 @@ def _bound(
     lanes,
     loops: bool = False,
 ) -> tuple[Callable, list]:
-    """The program of a kernel, and the arrays of its trees."""
+    """The program of a kernel, which is found again by all but the values of arrays, and the
+    arrays of its trees."""
     leaves, structure = jax.tree_util.tree_flatten(trees)
     arrays = [_nearby(x) for x in leaves if _is_array(x)]
     key = function, form, static, lanes, identity(trees)
@@ -467,6 +472,8 @@ _kernels_lock = threading.Lock()
 
 
 def _kernel_program(function, form, static, structure, leaves, options) -> Callable:
+    """The program of a kernel. Leaves that are no arrays (`still`) become part of it; arrays are
+    its first argument."""
     still = [None if _is_array(x) else x for x in leaves]
     places = [k for k, x in enumerate(leaves) if _is_array(x)]
 

@@ -1,4 +1,14 @@
-"""The exceptions that hybridjax raises. All derive from `HybridJaxError`."""
+"""The exceptions that hybridjax raises. All derive from `HybridJaxError`.
+
+Each kind is also an error of Python of its meaning (`ValueError`, `RuntimeError`, ...), and the
+public ones belong to the module `hybridjax.errors`; both must stay, as users catch them by these
+names. A new public one is also a line in `errors/__init__.pyi`.
+
+`DefinitionError` is for what a user has given, `ComputationError` for what was computed from it. If
+the wrong one is raised, look where it is raised. If a `FindingWarning` is not seen, it is the
+filter here, which is silent by default; if the sentence of an `UnknownAttribute` is wrong, look at
+`boundary/leads.py`.
+"""
 
 import warnings
 from collections.abc import Callable

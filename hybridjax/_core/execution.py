@@ -4,6 +4,9 @@ Batches of experiments and of cycles call `in_threads`, large operations of NumP
 Threads of BLAS would compete with these: `one_blas_thread` switches them off for the whole process
 and counts how often it was entered, so that the last exit restores them. If a call is slow on many
 cores, look whether `libraries` finds the OpenBLAS of NumPy and SciPy; others are left as they are.
+
+Results must stand in the order of the items. The functions of another build of OpenBLAS are a line
+in `_NAMES`. If calls in threads wait for each other for ever, look at `in_turn` (`compilation.py`).
 """
 
 import contextlib

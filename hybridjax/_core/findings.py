@@ -1,4 +1,14 @@
-"""`Finding`: a doubt about data, a fit or a cycle, named by its cause."""
+"""`Finding`: a doubt about data, a fit or a cycle, named by its cause.
+
+Recordings, fits, cycles and trajectories make findings and keep them in `findings`. `refuse` raises
+an error of those that are "refused", `warn_of` warns (silently, see `exceptions.py`), and
+`print_findings` makes a part of what results print. A new finding is made where it is found; its
+`cause` must be the same for all of its type, as tables have it as a column.
+
+If a finding is missing or wrong, search for its `cause`: the function that has these words looks
+for it, and decides by the `action` whether data are refused. If a warning names the wrong line,
+look at `frames_to_user` (`call.py`).
+"""
 
 import textwrap
 import warnings

@@ -84,12 +84,14 @@ def by_columns(
         def values(t, x):
             return None if still(t) else x
 
+        # The numbers that move. Unless they are few and known, JAX derives the program.
         moving = jax.tree_util.tree_map(values, moved, arguments, is_leaf=still)
         leaves, structure = jax.tree_util.tree_flatten(moving)
         ends = np.cumsum([x.size for x in leaves])
         is_small = len(leaves) and ends[-1] <= most
         if is_hidden(arguments) or not is_small:
             return _compiled_derivatives(compiled, arguments, tangents)
+        # A direction for each of them, in the form of the arguments.
         parts = np.split(np.eye(ends[-1]), ends[:-1], axis=1)
         parts = [y.reshape(-1, *x.shape) for x, y in zip(leaves, parts, strict=True)]
         directions = jax.tree_util.tree_unflatten(structure, parts)

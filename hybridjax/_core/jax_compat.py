@@ -5,6 +5,12 @@ what breaks if a later version gives another answer. `tests/_core/test_jax_compa
 version of JAX that all were tested with, and tries each of them. No other file of this package
 imports `jax.core`, `jax.extend`, `jax.interpreters` or `jax.experimental`, reads JAX's
 configuration, or contains the name of a primitive or an option of XLA.
+
+After an update of JAX, run that test first. If programs are slower, look at `_FUNCTIONS` (functions
+that are replaced) and at `is_known` (options that XLA has not); if threads wait for each other for
+ever, at `_LAPACK`; if a smooth field is taken for one that jumps or has pulses, at `suddenness` and
+the tables `_SMOOTH` to `_KINKS`, which need the name of each new primitive; if a change of a
+function is not noticed, at `is_call`, `has_rule` and `is_hosted`.
 """
 
 import contextlib

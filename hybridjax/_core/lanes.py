@@ -3,7 +3,8 @@
 A lane is one of many states that a program computes at once; lanes stand on the last axis of an
 array. An argument that all lanes share (a system's parameters, say) is passed as it is. One that
 differs from lane to lane is marked by `PerLane`. Called by the engine, systems, sections and
-orbits.
+orbits, all of which rely on lanes that stand last. Constants here decide between two ways to the
+same numbers, up to rounding.
 
 If derivatives are right for one lane and wrong for several, look at `lane_jvp`; if `jax.vmap` gives
 other values than a loop, at `vmap_to_lanes` and `_join`.
@@ -157,6 +158,7 @@ def _join(x, mapped: bool, by_lane: bool, size: int, L: int):
 
 
 def _join_common(tree, mapped, size: int, L: int):
+    """Join mapped axes of a tree (`mapped`: a mask of its arrays) with lanes; `PerLane` if any."""
     arrays, static = eqx.partition(shared(tree), eqx.is_array)
     leaves, structure = jax.tree_util.tree_flatten(arrays)
     mapped = jax.tree_util.tree_leaves(mapped)
@@ -172,7 +174,8 @@ def _join_common(tree, mapped, size: int, L: int):
 
 
 # Up to this many numbers that a lane's result depends on, its Jacobian is computed. Twice as many:
-# a Jacobian of 64 columns takes longer than the reverse mode that it spares.
+# a Jacobian of 64 columns takes longer than the reverse mode that it spares. Fewer: reverse mode
+# stores all that happens in more functions.
 JACOBIAN_COLUMNS = 32
 
 
@@ -180,6 +183,7 @@ def lane_jvp(
     function: Callable, lane: tuple[Any, Any], shared: tuple[Any, Any]
 ) -> tuple[Any, Any]:
     """`function(lane, shared)` and its tangent; `lane` and `shared` are pairs (primal, tangent).
+    (`shared` is not the function of this name.)
 
     Arrays of `lane`, and of the result, have the lanes on their last axis; all lanes share those of
     `shared`. Tangents are `None` where there are none.
@@ -204,6 +208,7 @@ def lane_jvp(
 
     _, parts = ravel_pytree(point)
 
+    # The Jacobian: derivatives in the direction of each number, for all lanes at once.
     def push(direction):
         of_lane, of_all = parts(direction)
 
@@ -215,8 +220,8 @@ def lane_jvp(
 
     end, columns = jax.vmap(push, out_axes=(None, 0))(jnp.eye(total))
 
-    # One row for each direction: Shape (total, L) if lanes have different values, otherwise (total,
-    # 1).
+    # The tangents, by which its columns are weighted: a row for each number, of shape (total, L)
+    # if lanes have different values, otherwise (total, 1).
     rows = [t.reshape(-1, t.shape[-1]) for t in leaves(t_moving)]
     for leaf in leaves(t_common):
         rows.append(jnp.broadcast_to(leaf.reshape(-1, 1), (leaf.size, 1)))

@@ -1,4 +1,14 @@
-"""A loop that carries its forward-mode derivatives along in the same iterations."""
+"""A loop that carries its forward-mode derivatives along in the same iterations.
+
+`engine/itinerary/turn.py` calls it for trajectories that follow an itinerary. The carry is what an
+iteration changes and what has derivatives; notes (flags, say) have none. Columns are the
+derivatives of the carry in several directions, which stand on the first axis.
+
+`step` and `step_along` must compute the same carry and notes; `pushed` makes a part of `step_along`
+of a function. If a derivative is wrong, compare `step_along` with `jax.jvp` of `step`; if it is
+wrong for several lanes only, look at `_of_directions`. That reverse mode is refused is no fault: a
+`jax.lax.scan` is needed for it, as in `turn.py`.
+"""
 
 from collections.abc import Callable
 from typing import Any

@@ -6,6 +6,15 @@ notice later that one of these has changed. So in each public call, `current` tr
 functions again and compares the programs (`programs.py`). It skips this if a reading of the code
 (`reading.py`) proves that nothing has changed. Definitions that are no systems are known by their
 code alone.
+
+A class of definitions that is to be traced registers its parts with `parts_of`. The conditions in
+`_digest_of` under which nothing is traced must stay: each stands for a change that would be missed.
+
+If a change is not noticed, look at what `reading.py` has read (`Reading.unread` must name the
+rest), then at `programs.py`; if a function is refused because it "computes another value each
+time", at `_require_the_same`; if it is refused because of what it reads, at `Reading.hidden`,
+`moving` and `traced`; if each call traces a system again, print `unread` of the reading in
+`_digest_of`.
 """
 
 import collections
@@ -93,6 +102,7 @@ def _require_values(reading: Reading) -> None:
 
 
 def _mark(x: Any, digest: str) -> Any:
+    """Return a copy of a definition with this digest as its `code_digest`."""
     leaves, structure = jax.tree_util.tree_flatten(x)
     marked = jax.tree_util.tree_unflatten(structure, leaves)
     object.__setattr__(marked, "code_digest", digest)
@@ -145,6 +155,12 @@ def _identity(x: Any) -> Hashable:
 
 
 def _digest_of(x: Definition) -> str:
+    """Return the digest of a definition, without looking whether it is known in this public call.
+
+    A system is read; it has the digest of before if nothing can have changed. Otherwise it is
+    traced; what is new is compared with further traces, to find functions that compute another
+    value each time. Other definitions have the digest of their reading.
+    """
     if parts_of.dispatch(type(x)) is parts_of.dispatch(object):
         reading = Reading(_without_arrays(x))
         _refuse((*reading.hidden, *reading.moving))
@@ -244,6 +260,7 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
         arguments = [f"{keystr(path)}:{y.dtype}{y.shape}" for path, y in leaves]
         digests = Digests(program, [*arguments, "t", "q", "u"])
         rule = ""
+        # A rule for derivatives is no part of the program: it is seen in that of a derivative.
         if digests.rules:
 
             def along(a, *y):

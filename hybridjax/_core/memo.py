@@ -1,4 +1,14 @@
-"""Values that are computed once for an object, and forgotten with it."""
+"""Values that are computed once for an object, and forgotten with it.
+
+Systems, cycles, models and fits keep here what takes long to compute: by `remembered`, a property;
+by a `Memory`, also with a key; by `Recent`, the last few values. The object is the owner of its
+values. A value in a `Memory` must not refer to its owner: neither would ever be forgotten.
+
+If memory grows, look for a value that refers to its owner; if a value of earlier arguments comes
+back, for an argument that is missing in the key (`Memory`) or in `others` (`Recent`); if a value is
+computed again and again, look whether the owner is made anew each time, as owners are known by
+identity.
+"""
 
 import collections
 import functools

@@ -1,4 +1,14 @@
-"""Double precision: switched on by the user, required by the solvers."""
+"""Double precision: switched on by the user, required by the solvers.
+
+Functions that compute call `require_x64` first; `real` converts fields of systems, transitions,
+guesses, sections and settings. The precision must not be switched when the package is imported,
+since the switch holds for all programs of JAX in the process.
+
+If an array is refused without need, look at the leaf that `require_x64` names; if numbers of a
+definition that was made before `enable_x64` have lost digits, look whether their field has the
+converter `real`; if a worker or a thread computes in single precision, at its start
+(`pieces/cluster.py`, `execution.py`).
+"""
 
 from typing import Any
 

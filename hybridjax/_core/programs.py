@@ -4,6 +4,13 @@ A program is what JAX traces of a function. Each of its results has its own dige
 operations that lead to the result from the arguments and constants. Names do not enter, nor
 operations whose results are not used, nor how the program is divided into functions of `jax.jit`.
 Called by `meaning.py`.
+
+All that changes a result must enter its digest, the same in every process: programs of equal
+digests are taken for each other.
+
+If a change of a function is not noticed, look at `_option` (what an operation is told beside its
+arguments), and at `rules` and `hosted`, of which the caller must take account; if a function counts
+as changed and is not, at the last line of `_option`, where `repr` may write an address.
 """
 
 import hashlib

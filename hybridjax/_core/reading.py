@@ -3,6 +3,16 @@
 A digest is a short text that is equal for equal content. If the digest is the same as before, and
 nothing was left unread, then nothing has changed. If it differs, the function may still compute the
 same: `meaning.py`, which calls this module, then compares traces.
+
+What is not read must be listed in `unread`, never left out; and a digest must be the same in every
+process, so no address or order of a set may enter. A further type of objects is a method of
+`Reading` and a line in `_OF_THIS_TYPE` or `_OF_SUBTYPES`; a package whose functions depend on their
+arguments only is a name in `_PURE`.
+
+If a change of a value is not noticed, look at the method that reads objects of its type
+(`_reader_of`), then at `_PURE`; if a function is refused without need, at `_suspect` and
+`_is_hidden` with the words in `_HIDDEN` and `_FILES`; if a system is traced at each call, at its
+`unread`; if a user's file counts as one of a package, or the reverse, at `is_of_package`.
 """
 
 import builtins
@@ -87,8 +97,8 @@ _MOST = 20_000
 # Notes of which a hash is taken at once. Fewer: readings take longer. More: long lists of numbers
 # fill the memory.
 _AT_ONCE = 1000
-# Bytes of an array that a mark digests. More: calls take longer than tracing does. Fewer: systems
-# with tables are traced again at each call.
+# Bytes of an array that is still read with `marks`. More: calls take longer than tracing does.
+# Fewer: systems with tables are traced again at each call.
 _LARGE = 1_000_000
 
 _PACKAGE = os.path.join(pathlib.Path(__file__).parents[1], "")
@@ -104,7 +114,7 @@ Names = tuple[str, ...]
 
 
 class _TooMany(Exception):
-    """A mark would read too many objects."""
+    """A reading would visit more than `_MOST` objects."""
 
 
 class Reading:
@@ -164,6 +174,8 @@ class Reading:
         self._visit_all(itertools.chain.from_iterable(items))
 
     def _visit(self, x: Any) -> None:
+        """Read a value and what it refers to; of an object that was visited before, note its
+        number."""
         kind = type(x)
         if kind in _PLAIN:
             return self._note(kind.__name__, x)
@@ -599,6 +611,8 @@ def _imported(name: str, level: int, space: dict[str, Any]) -> types.ModuleType 
 
 @ft.lru_cache(4096)
 def _code(code: types.CodeType) -> str:
+    """Return the digest of code, of the names in it and of its constants, but not of its lines and
+    file."""
     names = (code.co_names, code.co_varnames, code.co_freevars)
     counts = (code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
     return Reading(code.co_code, *names, *counts, *code.co_consts).digest
@@ -624,6 +638,8 @@ _READING_ATTRIBUTES = frozenset(
 
 @ft.lru_cache(4096)
 def _names(code: types.CodeType) -> _Names:
+    """Return what code names, from its instructions: a path goes on as long as each next
+    instruction reads an attribute."""
     paths: list[Names] = []
     imports: list[tuple[str, int]] = []
     attributes: list[str] = []

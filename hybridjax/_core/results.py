@@ -1,4 +1,13 @@
-"""Result codes of numerical work: one per lane of a batch, the first failure wins."""
+"""Result codes of numerical work: one per lane of a batch, the first failure wins.
+
+A lane is one of many states that a program computes at once. The engine, orbits and experiments
+record codes by `update_result`. Numbers are written into stores of sweeps and experiments, so that
+a number must not get another meaning; a new code takes the next one. (2 is not in use.)
+
+If a code is wrong, look for the first `update_result` in the computation that finds a failure:
+later ones do not replace it. If a message does not help, change its sentence here, and not its
+number.
+"""
 
 import enum
 

@@ -1,5 +1,13 @@
 """Names of signals with their units: strings that know their unit, from the declaration in a system
 to the axes of figures.
+
+A `Signal` must stay a string with the hash of its name, so that it is found in dictionaries of
+names. A further unit of time is a line in `SECONDS`.
+
+If a unit is missing in a table or figure, look for the place where its name became a plain string:
+`str(name)`, f-strings and methods of strings return names without a unit. If a name is not found
+among names that look the same, their units differ (`__eq__`). If a unit is written badly, look at
+`ratio`, `square` and `with_unit`.
 """
 
 from collections.abc import Iterable

@@ -7,7 +7,10 @@ calls `write_report`. Numbers and the text about a result are those of
 `recordings.identification.Identification`: if one is wrong, look there.
 
 A further figure is a line in `_figures` (or `_natural_figures`), its caption in `_CAPTIONS` and its
-name in `report_folder`, which replaces the files of an earlier report.
+name in `report_folder`, which replaces the files of an earlier report. Keys of `summary.json` must
+stay: `subjects.py` and users read it. If a figure is written but not on the page, its name begins
+with no key of `_CAPTIONS` (`_shown`); if a folder is refused, look at `report_folder` and at
+`_core/writing.py`.
 """
 
 import base64

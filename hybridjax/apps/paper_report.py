@@ -3,6 +3,10 @@
 Nothing is estimated here; each observation compares numbers of the results of `reproduce.py` with a
 statement of the paper. If a number is wrong, look at the fit it is read from; if an observation is,
 at its `_about_...`.
+
+A further observation is a function `_about_...` that `_observations` calls. The bounds in these
+functions say when a statement of the paper counts as confirmed, and must not follow the results.
+`table` reads the summary by its keys, and so may users (`summary.json`): keys must stay.
 """
 
 import dataclasses

@@ -6,6 +6,10 @@ failure becomes a sentence and does not stop the others. The fits are then read 
 (`_population`), compared (`_effects`) and written (`_write`). If a report is not made anew although
 something has changed, or made anew without need, look at `job` in `_report`; if a row of the table
 is refused, at `_rows`. Wrong means have their cause in `recordings/population/`.
+
+All on which a report depends must be in `job`. A further figure, of a quantity of `Population`, is
+a line in `_FOREST`; a further column of the table one in `_COLUMNS`, with its key in `summary.json`
+(`_summary_of_data` in `identify.py`).
 """
 
 import concurrent.futures

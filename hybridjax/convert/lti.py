@@ -11,6 +11,10 @@ Lifting is in Bittanti and Colaneri, *Periodic Systems*, 2009, sec. 6.2. The har
 truncated, with an error that is measured against `LimitCycle.htf` (`_error_of`); the others are
 exact.
 
+The order of stacked signals must stay: section by section in `to_lti`, harmonic by harmonic in
+`to_control` and `HarmonicStateSpace`, and within each the signals as the model has them. Matrices
+and names are stacked in different places, by `reshape` and by `itertools.product`.
+
 If a harmonic state space is inaccurate, look at its `error`, then at `_linearized` (nodes) and
 `_toeplitz`; if signals of a lifted system are exchanged, at `_at_sections`.
 """
@@ -89,7 +93,8 @@ def to_lti(model: LDTP) -> LDTP:
     N, _, nu = B.shape
 
     def advance(carry, section):
-        # The state at section n: from that at section 0, and from the inputs since then.
+        # The state at section n: from that at section 0 (d, d), and from the inputs of all N
+        # sections (d, N, nu), zero for later ones.
         from_state, from_inputs = carry
         n, A, B, C, D = section
         outputs = jnp.einsum("ij,jkl->ikl", C, from_inputs)

@@ -2,7 +2,8 @@
 
 Each type of result has a function that is registered with `_columns` and returns the columns by
 their names, or a finished table. Results with named axes go through `to_xarray`. A new type of
-result is one more function here; a result without one shows its findings.
+result is one more function here; a result without one shows its findings. Names of columns must
+stay: users read tables, and files that were made of them, by these.
 
 If a table has wrong numbers, look at the fields of the result first; if a column is missing, at the
 function of its type.

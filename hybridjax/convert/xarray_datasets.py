@@ -7,8 +7,12 @@
 | all other fields | JSON in the attribute `hybridjax` | `_from_module` |
 
 `from_xarray` goes the same way back (`_coordinates`, `_arrays`). `Recording`, `SectionData`,
-`LimitCycles` and `Branch` only become datasets, each by a function of its own. If an array has
-wrong dimensions, look at `_axes`.
+`LimitCycles` and `Branch` only become datasets, each by a function of its own. A change of one way
+needs one of the other; names of dimensions and coordinates must stay, as users select by them. A
+new name of an axis in annotations gets its dimension in `_AXES`.
+
+If an array has wrong dimensions, look at `_axes`; if a good dataset is refused, at `_require_order`
+for parts of one, then at the constructor that `put_together` calls (`_core/archive.py`).
 """
 
 import json

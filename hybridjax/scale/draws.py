@@ -153,6 +153,11 @@ class Draws:
         return {name: stacked(name, columns[name], x) for name, x in variables}
 
     def _draw(self, i: int) -> dict[str, np.ndarray] | ComputationError:
+        """Return the numbers of draw i by name, with `failed`; or the `ComputationError` that it
+        raised.
+
+        **Raises:** `DefinitionError` for results that are no numbers, or have a name of our own.
+        """
         stream = np.random.SeedSequence(self.seed, spawn_key=(i,))
         try:
             values = self.function(np.random.default_rng(stream))

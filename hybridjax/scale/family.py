@@ -5,6 +5,10 @@
 parameters that returns a system. `Family.describe` is the part of a sweep's description by which a
 store recognizes the model. If a point gets the values of another one, look at `Space.at`; if a
 changed model is not noticed, at `Family.describe`.
+
+The order of parameters in `Space.axes` must stay that in which they were given: it is the order of
+the dimensions of results and of stores. A further way to choose points is a class method of
+`SweepPoints`, as `sobol`. If a parameter is refused without need, look at `Family.__init__`.
 """
 
 import contextlib

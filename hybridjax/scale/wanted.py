@@ -2,9 +2,10 @@
 
 `sweeps.py` calls `variables` once for the names, axes and types of results, and `values` for the
 cycles of each piece; `draws.py` uses the functions at the end. A new quantity is a name in `Want`,
-a line in `Wanted._values`, and its axes and units in `Wanted.variables`. If a value is NaN without
-need, look at `_values` (cycles that were not found) or `_measured` (a user's function that raises
-`ComputationError`).
+a line in `Wanted._values`, and its axes and units in `Wanted.variables`. Both must agree on names,
+types and shapes, since all pieces go into one store. If a value is NaN without need, look at
+`_values` (cycles that were not found) or `_measured` (a user's function that raises
+`ComputationError`); if a user's function is refused, at `Wanted.__init__` and `stacked`.
 """
 
 import itertools

@@ -8,6 +8,14 @@ A call of a decorated function goes through `_wrapped`, in this order:
 3. Each argument is brought to the form of its kind (`parameters.py`), or a `DefinitionError` of one
    sentence is raised. The function is called.
 4. An error of JAX because it traces what the function needs becomes `NeedsValues`.
+
+A function or class that users call gets `checked`; a result, whose constructor only this package
+calls, `checked_methods`; the constructor of a user's own system calls `check_fields`. The order of
+the steps must stay: step 2 leaves the traced program, so that step 3 sees values.
+
+If a good argument is refused, or a bad one taken, look at its kind (`kinds.py`); if the end of a
+message leads to the wrong thing, at `leads.py`; if `NeedsValues` is raised without need, at what
+the function does with values, and at `_is_constant`.
 """
 
 import functools
@@ -156,6 +164,10 @@ def taken_parameters(
 
 
 def _wrapped(function: Callable, name: str, cls: type | None = None) -> Callable:
+    """A function whose calls take the steps above.
+
+    **Arguments:** `name`: of the function in errors. `cls`: its class, if it is a constructor.
+    """
     kinds = Parameters(function, cls)
 
     @functools.wraps(function)

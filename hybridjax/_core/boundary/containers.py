@@ -3,6 +3,10 @@
 A kind describes the values that an argument may have; `take` returns the value in the form in which
 functions use it, or raises `Misfit`. `checked.py` calls it, by way of the names in `kinds.py`.
 
+A new container is a subclass with `allowed` (the words after "must be") and `take`, which must hand
+items to their kinds by `_taken`, so that errors say where an item stands. It stands in
+`Annotated[...]`, or `kind_of` (`kinds.py`) makes it of a plain type.
+
 A result of several steps stands for its parts (`_parts`, `_stands_for`): if a function gets a fit
 instead of the whole result, or the reverse, look at the order in `Instance` and `Having`. If a
 message names the wrong one of several types, look at `Either`.

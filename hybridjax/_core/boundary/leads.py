@@ -7,7 +7,7 @@ The tables in `guesses` are read only where an error is raised.
 
 Leads are tried in an order, the certain ones first (`_leads_of_name`, `_leads_of_attribute`,
 `_leads_of_argument`): if a message leads to the wrong thing, look there; if it leads nowhere, add a
-line to a table in `guesses`.
+line to a table in `guesses`. A new way to find a lead is one more `yield` at its place in an order.
 """
 
 import dataclasses
@@ -30,7 +30,8 @@ _LISTED = 24
 
 
 # Likeness of two spellings above which one is suggested for the other when nothing else was found;
-# see `spelling.py`.
+# see `spelling.py`. Lower: names of other things are suggested. Higher: fewer guesses lead
+# anywhere.
 _ALIKE = 0.7
 
 

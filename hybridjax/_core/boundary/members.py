@@ -2,6 +2,15 @@
 method that is used without calling it. Each message says in one line what to do instead.
 
 `checked.py` and `showable.py` put these functions into public classes.
+
+A missing attribute must stay an `AttributeError` (`UnknownAttribute` is one), and one whose name
+begins with an underscore a plain one: Python and JAX ask for many that are not there. A `Method`
+must stay a pytree whose child is its object, as equinox binds methods.
+
+If a message leads to the wrong attribute, look at `leads.py`; if a property is said to be missing,
+at the error that it raises (`missing_attribute`); if a result can be changed, whether its class has
+`fixed_attribute`; if a method prints all numbers of its object, whether its class was given to
+`bind_methods` or `checked_methods`.
 """
 
 import dataclasses

@@ -4,7 +4,11 @@
 (`values.py`, `containers.py`), or raises a `Misfit` for the first that does not fit; `_lead` ends
 its sentence with what may have been meant. `is_wrong` and `about_wrong` are for arguments that are
 unknown, too many or too few. If a good argument is refused, look at its kind first
-(`Parameters.by_name`).
+(`Parameters.by_name`); if a message speaks of a wrong order of arguments without need, at `_lead`.
+
+Kinds must not be determined before the first call: only then do all names in annotations exist.
+What `_lead` and `about_wrong` find out may take time, since an error is raised; `is_wrong` and
+`take` are part of each public call.
 """
 
 import functools
@@ -63,7 +67,8 @@ class Parameters:
         return self.function(*taken, **by_name)
 
     def take(self, args: tuple, kwargs: dict[str, Any]) -> tuple[list, dict[str, Any]]:
-        """The arguments in the form in which the function gets them.
+        """The arguments in the form in which the function gets them: those by position, and
+        `kwargs` itself, whose values are replaced.
 
         **Raises:** `Misfit` for the first that does not fit.
         """

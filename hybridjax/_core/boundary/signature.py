@@ -1,4 +1,14 @@
-"""Signatures as users read them in `help`: with the annotations of the source."""
+"""Signatures as users read them in `help`: with the annotations of the source.
+
+`checked.py` gives each public function a `ShortSignature`, which `help` and `inspect.signature`
+show. It must stay lazy: a source is read and parsed when a signature is first asked for, and not
+when the package is imported. Only what is shown comes from here; arguments are checked against the
+annotations themselves (`parameters.py`).
+
+If `help` shows the text of a check, such as `Annotated[int, ...]`, look at `_WithoutChecks`; if it
+shows types in place of the words of the source, at `_definition`, which has found no source; if
+annotations of a constructor are missing, at `_of_fields`.
+"""
 
 import ast
 import functools

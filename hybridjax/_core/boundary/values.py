@@ -9,6 +9,10 @@ signatures in `kinds.py`.
 A new kind is a subclass with `allowed` (the words after "must be") and `fits`, or `take` if it
 changes the value. If a good value is refused, look at `take` of its kind; if a message describes a
 value badly, at `show`.
+
+Single numbers and switches must refuse what JAX traces (`refuse_traced`), and arrays must not look
+at its values. If a message names one kind where an argument may have several, look where `near` is
+set.
 """
 
 import contextlib

@@ -1,4 +1,15 @@
-"""Looking up the words of other libraries in the tables of `guesses`."""
+"""Looking up the words of other libraries in the tables of `guesses`.
+
+`leads.py` calls it, only where an error is raised: that must stay so, since tables are searched and
+other libraries imported. Words are compared by `plain` (`spelling.py`), without case, underscores
+and plural. An owner is the class, function or namespace to which the words of a table belong; ""
+owns those for all functions, or for the package.
+
+If a word leads to the wrong sentence, look at the order of `owners` in the call of `lead_of`: the
+first that has the word wins. If the words in a longer name are not found, look at `parts`, which
+leaves out words of one or two letters but those in `_SHORT`; if a word of this package is missing,
+at `WORDS` and `ALIKE` in `guesses/synonyms.py`.
+"""
 
 import functools
 import importlib

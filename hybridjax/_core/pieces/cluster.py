@@ -70,6 +70,7 @@ def _run(
     store: ArrayStore | ZarrStore,
     missing: Sequence[int],
 ) -> None:
+    """Send the job once and a task for each piece; write the values that tasks return."""
     # (As bytes: arrays keep their digits only if the precision is set before they are made.)
     packed = _packed((job, store.address))
     x64 = jax_compat.has_double_precision()
@@ -117,6 +118,7 @@ class _Packer(cloudpickle.Pickler):
 
 
 def _packed(job: Any) -> bytes:
+    """The job as bytes, with the digests of what workers import from users' modules."""
     file = io.BytesIO()
     packer = _Packer(file)
     packer.imported = []
@@ -150,6 +152,11 @@ def _piece(k: int, packed: bytes, x64: bool) -> dict[str, np.ndarray] | None:
 
 @functools.lru_cache(maxsize=4)  # a job keeps its compiled programs from piece to piece
 def _unpacked(packed: bytes, x64: bool) -> tuple[Any, ZarrStore | None]:
+    """Set up this process of a worker, and make the job and its store again.
+
+    **Raises:** `DefinitionError` if a function or class in a user's module is not the same here.
+    """
+    # The precision comes first: arrays that are made before it lose digits.
     if x64:
         jax_compat.use_double_precision()
     enable_compilation_cache()

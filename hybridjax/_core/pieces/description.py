@@ -2,6 +2,13 @@
 its description a later run recognizes results of the same job.
 
 `store.py` compares descriptions; the callers of `run.py` write them.
+
+Whatever changes numbers must be in a description, otherwise one store gets results of two jobs;
+whatever does not (how many processes) must not. The mark of digests, `_DIGEST`, is written into
+stores, and must stay.
+
+If a store is refused without need, the message has the entry that `difference` found: look where
+the job writes it. If a change is not noticed, look at `digest_of`, and at `meaning.py` behind it.
 """
 
 import importlib.metadata

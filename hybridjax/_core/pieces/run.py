@@ -2,6 +2,13 @@
 
 A piece is a block of points (of a sweep, say) that one call computes. Called by `scale` and
 `experiments/stored.py`.
+
+The order in `fill` must stay: a job begins, or resumes what a store holds, before its first piece;
+all pieces then have the same beginning. A new kind of job is an object with what `fill` asks for.
+
+If a piece is computed again without need, look at `missing` of the store (`store.py`); if results
+differ after an interruption, at `resume` of the job; if they differ, or fail, on workers, at
+`cluster.py`.
 """
 
 from typing import Any, Protocol, runtime_checkable

@@ -13,6 +13,10 @@ Matrices stand on the last two axes. Where LAPACK would report a failure, result
 infinite. Derivatives are those of the operations. G. H. Golub, C. F. Van Loan, Matrix Computations,
 4th ed. (2013), sections 3.4 and 4.2.
 
+A function that replaces one of JAX must return the same, up to rounding, and none may call LAPACK.
+A further one is entered in `_FACTORIZATIONS` (`rewrite.py`), and the name of its primitive in
+`_FUNCTIONS` (`jax_compat.py`).
+
 If a solution is inaccurate, compare with `jnp.linalg` for the same matrix; if a program calls
 LAPACK in spite of these, look at `rewrite.py`.
 """
@@ -94,6 +98,8 @@ def solve(
 
 
 def _eliminated(matrix, right):
+    """Return x (*b, n) in `matrix @ x = right`, for a matrix (n, n) and right sides (*b, n):
+    elimination downwards with pairwise pivoting, then substitution upwards."""
     n = matrix.shape[-1]
     # Each row is a list of its coefficients and its right side.
     rows = []
@@ -147,6 +153,8 @@ def solve_by_columns(
 
 
 def _by_columns(matrix, right):
+    """Return x (n,) in `matrix @ x = right`: in step k, column k becomes that of the unit
+    matrix."""
     n = len(right)
 
     def eliminated(k, rows):

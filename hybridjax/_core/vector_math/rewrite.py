@@ -6,6 +6,10 @@ the factorizations behind `jnp.linalg` by those of `factorizations` (docs/how-to
 reasons, accuracy). If a later JAX renames these equations, they are not found and not replaced:
 results are right, and slower.
 
+A further function is a line in `_TRIGONOMETRY` or `_FACTORIZATIONS`, and the name of its primitive
+one in `_FUNCTIONS` (`jax_compat.py`). What is put in must have the arguments, results and types of
+what it replaces; equations with derivative rules of their own must be left alone.
+
 If a rewritten program gives other results, look at the function that was put in (`trigonometry.py`,
 `factorizations.py`); if it is as slow as before, at the names of equations (`function_of` in
 `jax_compat.py`) and at the conditions in `_ours` and `_solved`.
@@ -127,6 +131,7 @@ def _rows(*parts):
 
 def _replaced(program: Program, trigonometry: bool) -> Program:
     """A program of the same type with our functions; itself if there is nothing to replace."""
+    # Solutions of linear systems are replaced as a whole; then nothing may need their factors.
     factors = set()
     for equation in program.eqns:
         if function_of(equation) == "lu":
@@ -134,6 +139,7 @@ def _replaced(program: Program, trigonometry: bool) -> Program:
     solved = [_solved(equation, factors) or equation for equation in program.eqns]
     if factors:
         solved = _without_unused_factors(program, solved)
+    # All others one by one, also in the programs inside of them.
     equations = [_replaced_equation(equation, trigonometry) for equation in solved]
     if list(map(id, equations)) == list(map(id, program.eqns)):
         return program

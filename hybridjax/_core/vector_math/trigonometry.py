@@ -95,6 +95,8 @@ def _polynomial(coefficients, z):
 
 @jax.custom_jvp
 def _sincos(x):
+    """Return sin and cos of x. Polynomials give those of the rest r after k quarter turns; the
+    quadrant then says which is which, and their signs."""
     n = _N
     k = jax.lax.round(x * (2 / jnp.pi), jax.lax.RoundingMethod.TO_NEAREST_EVEN)
     a = x - k * n.pi_2[0]
@@ -129,6 +131,8 @@ def _(xs, dxs):
 
 
 def _arctan2(y, x):
+    """Return the angle of the point (x, y). It is found for the shorter side over the longer one,
+    turned by pi/4 where this ratio is above tan(pi/8), then put into the octant of the point."""
     y, x = jnp.broadcast_arrays(y, x)
     n = _N
     ax = abs(x)

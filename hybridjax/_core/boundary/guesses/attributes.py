@@ -4,6 +4,11 @@ Tables for `leads.py`.
 
 A table has for each class the advice, and the words that lead to it. If a message gives the wrong
 advice for a word, move the word; `sentences.py` has advice that several tables share.
+
+If a word leads nowhere, add it to the words of its advice, or add an advice to its class; a class
+is asked before those that it is derived from. A word must stand once for a class, and be none of
+its attributes; calls and attributes in an advice must exist. `tests/test_guesses.py` checks all
+this.
 """
 
 from .sentences import (

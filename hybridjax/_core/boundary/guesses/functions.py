@@ -4,6 +4,11 @@ Tables for `leads.py`.
 
 A table has for each namespace the advice, and the words that lead to it. If a message gives the
 wrong advice for a word, move the word; `sentences.py` has advice that several tables share.
+
+If a word leads nowhere, add it to the words of its advice, or add an advice to its namespace; ""
+is the package. A word must stand once for a namespace, and be none of its public names (two that
+are parts of names are excepted); calls in an advice must exist. `tests/test_guesses.py` checks all
+this.
 """
 
 from .sentences import (

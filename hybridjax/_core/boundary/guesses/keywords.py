@@ -5,6 +5,11 @@ Tables for `leads.py`.
 
 A table has for each function ("" for all) the advice, and the words that lead to it. If a message
 gives the wrong advice for a word, move the word.
+
+If a word leads nowhere, add it to the words of its advice, or add an advice to its function, which
+is asked before "". A word must stand once for a function; calls and their arguments in an advice
+must exist (`tests/test_guesses.py` checks this). If the message about an argument that was left out
+is wrong, look at `NEEDS`, where `function.argument` is asked before `argument`.
 """
 
 from .sentences import AT_TIMES, CONTROL, HELD_OUT

@@ -6,6 +6,10 @@ Tables for `leads.py`.
 `MAKERS` has for each class how to make one, `STEPS` how to get one from another object, and
 `OBJECTS` the advice of a function for a type that it was given. If a message gives the wrong
 advice, change its line: `OBJECTS` is asked first, then `STEPS`, then `MAKERS`.
+
+If a message gives no advice, add a line. Keys hold the names of classes: in `MAKERS` of the one
+that is needed, in `STEPS` of (needed, given); in `OBJECTS` a key is `function.given` or
+`function.argument.given`. Calls in an advice must exist (`tests/test_guesses.py` checks this).
 """
 
 from .sentences import AT_TIMES

@@ -2,6 +2,11 @@
 
 A table for `words.py`, by which `leads.py` finds the argument or attribute that was meant. If a
 message proposes a wrong name for a word, change the line of the word here.
+
+If a word is not known, add it to the row of `ALIKE` that means the same, or make a new line of
+`WORDS`. A word must stand once in all of `ALIKE`, and the words on the right of `WORDS` must be
+arguments or attributes of this package, since they are proposed as they are
+(`tests/test_guesses.py` checks both).
 """
 
 WORDS = {
