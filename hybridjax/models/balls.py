@@ -2,8 +2,11 @@
 
 A single ball falls freely, so that its cycle on the paddle is known in closed form
 (`PaddleJuggler.exact`), which tests compare. On fixed ground, a restitution below 1 gives
-infinitely many impacts in finite time. If an impact is wrong, look at the reset in `transitions`,
-or in `ChainContact.impact`.
+infinitely many impacts in finite time. Guards are heights above the ground and must stay so, as
+they fall through zero at an impact. Tests rely on the default parameters.
+
+If an impact is wrong, look at the reset in `transitions`, or in `ChainContact.impact`; if a flight
+is, at the field in `charts` (`BouncingChain._flight`); if no cycle is found, at `guess`.
 """
 
 import equinox as eqx

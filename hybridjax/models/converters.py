@@ -1,4 +1,13 @@
-"""DC-DC converters with a switch that a controller closes and opens."""
+"""DC-DC converters with a switch that a controller closes and opens.
+
+Each class has two charts, "open" and "closed", named by the switch, whose equations are in
+`_circuit`; a clock (`Scheduled`) and a guard switch between them. The classes cite their sources.
+Tests rely on the default parameters. Each chart must have a transition for the tick of the clock,
+also where the switch stays as it is, so that no tick is missed.
+
+If a voltage or current is wrong between two events, look at `_circuit`; if the switch acts at a
+wrong time, at the guards in `transitions`; if no cycle is found, at `guess`.
+"""
 
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float

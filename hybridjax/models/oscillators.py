@@ -2,8 +2,11 @@
 
 Each class is one system and cites its source; where its equation is short, it stands in the
 docstring. Examples and tests rely on the default parameters and guesses. A further oscillator is
-one more class, with its name in `models/__init__.pyi`. If one has no cycle, look at its guess
-first.
+one more class, with its name in `models/__init__.pyi`.
+
+If one has no cycle, look at its guess first. If a motion or a multiplier is wrong, look at the
+field in `charts`. Two have several charts: if the chart is wrong, look at `BeltOscillator._parts`,
+or at the directions in `ChuaCircuit.transitions`.
 """
 
 import jax.numpy as jnp

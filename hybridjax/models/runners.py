@@ -4,7 +4,8 @@
 The charts of the bar are named by the legs that stand; `length`, `speed` and `force` of a leg are
 its whole mechanics. The quadruped is a bar with other parameters and a `reflex`; both of its feet
 land at the same time, so that events coincide. Examples and tests rely on the default parameters.
-If a touchdown is wrong, look at `_step` and `_impact`, or at `landed` of the point mass.
+If a touchdown is wrong, look at `_step` and `_impact`, or at `landed` of the point mass; if a
+motion is, at `length` and `speed`, then at the sums in `_support`, or at `_stance`.
 """
 
 import itertools

@@ -3,7 +3,9 @@
 Angles are from the vertical or from the normal of the slope, as the docstring of each class says,
 with the source. After an impact, the legs exchange their names (`after`, `_heelstrike`). Cycles and
 multipliers are published for the default parameters, or known in closed form (`exact`), and tests
-compare them. If a step is wrong, look at the guard and the reset in `transitions` first.
+compare them. If a step is wrong, look at the guard and the reset in `transitions` first; if the
+motion within a step is, at the field (`swing`, `_step`); if an animation is, at `draw`, and at the
+sign of angles in `_two_legs`.
 """
 
 import math

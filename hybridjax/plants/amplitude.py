@@ -4,6 +4,11 @@
 it, and to none. The response should be twice the response to half of the input. If it is not, the
 input is too large (curvature) or too small: simulators with fixed time steps let contacts begin at
 the ends of steps, so that the response is a *staircase* as a function of the input.
+
+The constants may be changed. The responses must be less the motion without input, with the same
+seed: noise and the rest of a transient would otherwise look like curvature. If a finding is
+needless or missed, look at the constants first; if stairs are not seen, at `_stairs`, which returns
+0 where the time steps of a plant cannot be shifted.
 """
 
 from typing import Any

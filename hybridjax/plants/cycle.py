@@ -2,10 +2,14 @@
 around it.
 
 `find_cycle` lets the plant settle, or solves for the cycle from a guess (`returns.py`). `_measure`
-then records some cycles, and returns a `PlantCycle`, whose methods run experiments. The plant
-itself is driven by `drive.py`: if a section is at a wrong time, or an input acts too late, look
-there. `_phase_of` turns a family of sections into the rule by which `drive.py` recognizes a
-section.
+then records some cycles, and returns a `PlantCycle`, whose methods run experiments. `_phase_of`
+turns a family of sections into the rule by which `drive.py` recognizes a section; a further family
+is added there. It must stay that the plant is on section 0 before `_measure` and before each
+`_turn`, which ends on the next section 0.
+
+The plant itself is driven by `drive.py`: if a section is at a wrong time, or an input acts too
+late, look there. If a plant is said not to have settled, look at `_require_settled`; if responses
+are not zero without input, at `at_rest` in `run_experiments`.
 """
 
 import dataclasses
@@ -411,6 +415,11 @@ def _turn(drive: Drive, family: Any, points: list[At]) -> tuple[At, list[At]]:
 
 
 def _require_settled(values: Float[np.ndarray, "n N ny"], size: np.ndarray) -> None:
+    """Compare the first half of n cycles with the last. `size` (ny,): ranges of the outputs.
+
+    **Raises:** `ComputationError` if the mean of an output changes by more than the output
+    scatters, and by more than 1e-4 of its range.
+    """
     half = len(values) // 2
     first = values[:half].mean(axis=0)
     last = values[-half:].mean(axis=0)
@@ -451,6 +460,8 @@ def _is_of_a_signal(crossing: Any) -> bool:
 
 
 def _at_crossings(drive: Drive, crossings: Sequence[Any]) -> PlantPhase:
+    """Sections where signals cross levels, one for each crossing. (A rising signal is negated, so
+    that all levels fall through zero.)"""
     names = drive.names
     require_among("signal", [x.signal for x in crossings], names, "Crossing: ")
     rows = []

@@ -4,10 +4,13 @@ harm to the others.
 `cycle.py` makes a `Drive`, which joins a `Plant` (`reset`, `step`) with a `PlantPhase` (which
 section comes when), and calls `advance` for single sections, or `resume` and `run_all` for many
 experiments in processes. Each returns points (`At`) or a `Trial`. A section at a wrong time comes
-from `PlantPhase.level`, a wrong signal on it from `_landed` or `_interpolated`.
+from `PlantPhase.level`, a wrong signal on it from `_landed` or `_interpolated`, a wrong start of an
+experiment from `Drive.begin`, and a worker that does not answer from `serve` or `run_all`.
 
-Workers import this file, so that it needs only Python. They are not those of `multiprocessing`,
-which would run the main script again, and cannot be ended one by one.
+Two things must stay: `PlantPhase.level` falls through zero at a section, and `serve` and `run_all`
+exchange the same messages in the same order. Workers import this file, so that it needs only
+Python. They are not those of `multiprocessing`, which would run the main script again, and cannot
+be ended one by one.
 """
 
 import contextlib
@@ -157,6 +160,10 @@ class Drive:
         self.last = At(0.0, ())
 
     def _take(self, observation: Any, t: float) -> None:
+        """Keep the signals that the plant returned for time t.
+
+        **Raises:** `ComputationError` for other names than before, and for NaN or infinity.
+        """
         names = tuple(observation)
         self.t = t
         if self.names and names != self.names:
@@ -403,6 +410,7 @@ def resume(
 
 
 def _start(packed: bytes, begun: list[Any]) -> Any:
+    """Start a worker process, append it to `begun`, and send it the packed drive."""
     # (One thread of BLAS, because the processes use all cores.)
     paths = [os.environ.get("PYTHONPATH"), *sys.path]
     path = os.pathsep.join(filter(None, paths))

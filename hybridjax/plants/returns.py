@@ -365,6 +365,8 @@ class ReturnMap:
         return slopes * self.size / self.size[:, None]
 
     def _slope(self, k: int, step: float, first: float) -> Float[np.ndarray, " d"]:
+        """Return the central difference of returns along coordinate k, with a step in units of the
+        smallest one. `first`: length of the first time step, in units of the plant's steps."""
         move = np.zeros(len(self.x))
         move[k] = step * self.h[k]
         above = self(self.x + move, first=first)

@@ -1,8 +1,13 @@
 """Figures of designs for a quantity of interest: spectra (`spectrum`), and standard errors against
 cycles (`standard_errors`).
 
+Colors, sizes and limits of axes may be chosen otherwise. It must stay that both functions take `ax`
+and get their panels from `look.panels`, so that they fit into Axes of users.
+
 Powers and errors are those of an `OptimalDesign` or a study: if one is wrong, look at
-`designs/optimize.py` or `designs/study.py`.
+`designs/optimize.py` or `designs/study.py`. Two things are computed here: the amplitudes in
+`spectrum`, from the powers of all lines of one frequency, and the lines of `standard_errors`, which
+fall with the root of the number of cycles.
 """
 
 from collections.abc import Mapping, Sequence

@@ -2,8 +2,8 @@
 
 `Explorer` has the last cycle that was found and continues it to other parameters (`_follow`, in
 shorter steps where one fails). `_draw` moves the artists of one figure. In notebooks, the page
-`_PAGE` (JavaScript) and Python exchange two messages, `asked` and `answer` (`widget`, `_answer`).
-In scripts, `show` opens sliders of matplotlib.
+`_PAGE` (JavaScript) and Python exchange two messages, `asked` and `answer` (`widget`, `_answer`),
+whose keys must be the same on both sides. In scripts, `show` opens sliders of matplotlib.
 
 If a cycle is lost without need, look at `_follow`; if the picture is not that of the sliders, at
 `number`, `waiting` and `moved` in `_PAGE`; if moving is slow, at `_draw` (the gain takes as long as
@@ -137,6 +137,8 @@ class Explorer:
         self.figure.canvas.draw_idle()
 
     def _follow(self, values: Mapping[str, float]) -> None:
+        """Continue the cycle to these values, in shorter steps where one fails. If it is lost, keep
+        the last one, and say so in `message`."""
         self.values |= {name: float(x) for name, x in values.items()}
         begin = {
             name: float(parameter_of(self.cycle.system, name)) for name in self.values
@@ -244,6 +246,11 @@ class Explorer:
         gain: bool,
         number: int,
     ) -> dict[str, Any]:
+        """Return the answer to a message of the page: the picture of the cycle at these values.
+
+        **Arguments:** `gain`: whether the gain is computed, too. `number`: number of the message,
+        which makes each answer another one.
+        """
         if values != self.values:
             self._follow(values)
         self._draw(gain)

@@ -1,4 +1,13 @@
-"""Frames of an animation as images of few colors, and files of them."""
+"""Frames of an animation as images of few colors, and files of them.
+
+`motion.py` calls `frames` for the images, `gif` for a file, and `player` for the HTML of a notebook
+or a page; `explorer.py` uses `Easel` and `png`. Only the artists that `draw` returns are drawn anew
+in each frame: others stay as they are in the first. All images must have one palette, of fewer than
+256 colors: `player` compares the frames by these numbers, and adds one clear color.
+
+If an artist does not move, it is missing among those of `draw`; if a color is wrong, look at
+`_PALETTE`; if a GIF is too fast or too slow, at `gif`; if a page has holes, at `clear` in `player`.
+"""
 
 import base64
 import io
@@ -80,7 +89,8 @@ def frames(
     ]
 
 
-# White, that of bodies, and each of the palette in four shades, as at the borders of lines.
+# White, that of bodies, and each of the palette in four shades, as at the borders of lines. More
+# shades: larger files. Fewer: lines have rough borders.
 _INKS = np.array([to_rgb(color) for color in COLORS.values()])
 _SHADES = (1 + np.arange(1, 5)[:, None, None] / 4 * (_INKS - 1)).reshape(-1, 3)
 _WHITE = np.ones(3)

@@ -1,6 +1,12 @@
 """The figure of each type of result that one would ask for first: `result.plot()`.
 
-Types of data and fits stand in `first_of_data`, which imports more than a first cycle needs.
+`Showable.plot` (`_core/showable.py`) calls `draw`, which chooses a figure by the type of a result.
+The figure of a new type is registered with `draw.register`: of systems and cycles here, of data and
+fits in `first_of_data.py`. That file must be imported by `draw` alone, since it imports more than a
+first cycle needs.
+
+If a result has no figure or the wrong one, look at its line here or there; if a curve is wrong, at
+the function in that line; if time series are, at `rows`.
 """
 
 import functools

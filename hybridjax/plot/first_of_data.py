@@ -2,9 +2,11 @@
 
 `first.draw` imports this file for types that it does not know itself. The figure of a type is
 registered with `draw.register`, or is drawn by a function here. A new type of result is one more
-such line; a subclass without a line gets the figure of its base class.
+such line; a subclass without a line gets the figure of its base class. Every figure must take `ax`
+and return a `Plot`.
 
-If a result has no figure or the wrong one, look at its line here.
+If a result has no figure or the wrong one, look at its line here; if a figure has wrong numbers, at
+the function in that line, and then at the fields of the result.
 """
 
 from typing import Any

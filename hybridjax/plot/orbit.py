@@ -154,6 +154,10 @@ def _arrow(
 
 
 def plane_of(s: Structure, x: str | None, y: str | None) -> tuple[str, str]:
+    """The names of two states or outputs, by default the first two states that every chart has.
+
+    **Raises:** `DefinitionError` if there are no two such states, and for unknown names.
+    """
     everywhere = s.states_everywhere()
     if (x is None or y is None) and len(everywhere) < 2:
         raise DefinitionError(
@@ -292,6 +296,7 @@ def _side(x: float, below: Any, above: Any) -> Any:
 
 
 def _sections(ax: Axes, s: Structure, placed: PlacedSections, names, center) -> None:
+    """A bar at each section, and the numbers of about eight."""
     width, height = ax.get_window_extent().size
     width_of_axes = np.ptp(ax.get_xlim())
     height_of_axes = np.ptp(ax.get_ylim())

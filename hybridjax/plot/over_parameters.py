@@ -1,4 +1,13 @@
-"""Limit cycles over parameters: branches, and maps of sweeps."""
+"""Limit cycles over parameters: branches (`branch`), and maps of sweeps (`sweep`).
+
+Users and animations call `branch`; the command `hybridjax sweep` calls `sweep`. Markers and colors
+may be chosen otherwise, but `_MARKS` must have one for each of the kinds of bifurcations (`KINDS`
+in `orbits/branches.py`).
+
+If a stable part is dashed, look at `_parts`; if a height is wrong, at `Branch.largest`; if a mark
+is at a wrong place, at the `bifurcations` of the branch. The numbers of a sweep are drawn as they
+are: if one is wrong, look at `scale/sweeps.py`.
+"""
 
 import itertools
 from typing import Any

@@ -2,8 +2,12 @@
 
 True values are crosses, estimates open markers; `_values` and `_series` read both from any result,
 `_borders` the 95 % confidence regions. `_zoom` decides whether an inset around the leading
-multiplier is drawn, and where. If a distance in the legend is wrong, look at `compare_multipliers`
-(`identify/multiplier_estimate.py`), which pairs estimates with true values.
+multiplier is drawn, and where. Markers, colors and places of the inset are a matter of taste; the
+regions are not: they are those of `MultiplierFit.ellipse`.
+
+If a distance in the legend is wrong, look at `compare_multipliers`, which pairs estimates with true
+values (`identify/multiplier_estimate.py`); if a region is missing or wrong, at `_borders` and at
+`ellipse` in that file; if an inset is missing, at the last condition of `_zoom`.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,13 @@
-"""Figures of populations: forest plots (`forest`), paired dots, and curves or maps of subjects
-(`subject_maps`).
+"""Figures of populations: forest plots (`forest`), paired dots (`paired`), and curves or maps of
+subjects (`subject_maps`).
 
-They draw tables and maps that `recordings/population/` computed: if an estimate, an interval or a
-band is wrong, look there.
+`first_of_data.py` registers `forest` and `subject_maps` for `result.plot()`. Sizes and colors may
+be chosen otherwise. Columns such as `estimate` and `low` are those of the tables of `Population`,
+and must have the same names there.
+
+The tables and maps are computed in `recordings/population/`: if an estimate, an interval or a band
+is wrong, look there. If a subject or a mean is in a wrong row, look at `at` in `forest`; if a dot
+is on the wrong side, at `side` in `paired`, which follows from the labels of its cell.
 """
 
 import numpy as np

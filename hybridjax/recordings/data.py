@@ -1,10 +1,13 @@
 """`SectionData`: inputs and outputs of a recording at the sections of its cycle, as deviations from
 the average cycle.
 
-`sample_sections` (`sampling.py`) makes it, and all estimates from recordings take it. Its `records`
-have the form that fits to time series use. Nothing is sampled here: if a deviation is wrong, look
-at `sampling.py`. If the band of an input is too narrow or too wide, look at `LEAST_POWER` and
-`input_spectrum`.
+`sample_sections` (`sampling.py`) makes it, and estimates of multipliers and of responses take it.
+Its `records` have the form that fits to time series use. Three things must stay, since others rely
+on them: inputs stand before outputs in `signals`, `units` and `spikes`; `times` and `trials` have
+one entry for each of the `records`; and samples in gaps are NaN.
+
+Nothing is sampled here: if a deviation is wrong, look at `sampling.py`. If the band of an input is
+too narrow or too wide, look at `LEAST_POWER` and `input_spectrum`.
 """
 
 from collections.abc import Sequence

@@ -2,7 +2,12 @@
 measured.
 
 They are read from the CSV table of the design (`Design.write`), and placed by the phase of the
-recording.
+recording. The order must stay: experiment s belongs to trial s, and its first row to section 0 of
+the first whole cycle.
+
+If a command is shifted by sections or cycles, look at `first_whole`, and at the rows of zeros
+before and after each experiment. A command is NaN outside of the first stretch of a trial's phase,
+and so after a long gap, too.
 """
 
 from pathlib import Path

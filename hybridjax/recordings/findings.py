@@ -1,7 +1,10 @@
 """Parts that all findings about recordings share: the result of an inspection (`Inspection`), and
 phrases for the places of samples.
 
-Findings about signals are made in `inspection/`, those about estimates in `fit_warnings.py`.
+Findings about signals are made in `inspection/`, those about estimates in `fit_warnings.py`: look
+there if one is missed or needless. If the times in a finding are wrong, look at `places`. The
+reason in `untried_orders` comes from `Split.compare_orders` (`held_out.py`), or in a loop from
+`best_order` (`identify/series/in_loop.py`).
 """
 
 from collections.abc import Iterable

@@ -5,7 +5,12 @@
 one kind, and the constants are their limits. Findings about the signals themselves are made in
 `inspection/`.
 
-If a finding is missed or needless, look at the constants of the function that yields it.
+A new finding about a fit is one more function, called in `diagnosis_of`. `undamped` and
+`_about_multipliers` skip fits that failed, whose multipliers mean little: this must stay.
+
+If a finding is missed or needless, look at the function that yields it: its limits are the
+constants here, or stand in it. If the expected standard errors are wrong, look at the end of
+`diagnosis_of`.
 """
 
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,11 @@
 `split` divides records into a part to be fitted and a part to be held out. `Split.best_order` and
 `compare_orders` choose the number of multipliers by the errors on the held-out part; `hold_out`
 fits the first part and validates the fit on the rest. A quarter is held out, and the constants
-limit it for long and short records. If too few strides are tested, look at `split`; if the chosen
-number is too large or too small, at `_AS_GOOD` and `_misfit`.
+limit it for long and short records. Two things must stay: no sample is in both parts, and all
+numbers of multipliers are compared on the same records.
+
+If too few strides are tested, look at `split`; if the chosen number is too large or too small, at
+`_AS_GOOD` and `_misfit`; if a number is said to need more cycles, at `Split._rough_fit`.
 """
 
 from typing import NamedTuple
@@ -89,7 +92,8 @@ class Split(NamedTuple):
         return compared.order, obstacle
 
     def compare_orders(self, most: int) -> tuple[HeldOutOrders, str]:
-        """Compare orders, as `best_order`."""
+        """Fit each order up to `most` to the early part, and compare the errors on the late part.
+        Return the comparison; and, as `best_order`, the reason why larger ones were not tried."""
         ends = uninterrupted_records(self.late)
         fits: list[SeriesFit] = []
         obstacle = ""

@@ -1,9 +1,14 @@
 """`identify_recording`: all steps from a recording to multipliers, in one call.
 
-It calls public functions in the order in which its source lists them, and returns their results as
-an `Identification` (or, without inputs, as a `NaturalIdentification`). Only the number of
-multipliers and the removal of drift are decided here. To find a wrong step, call the functions one
-by one.
+It calls the functions of the steps in the order in which its source lists them, and returns their
+results as an `Identification` (or, without inputs, as a `NaturalIdentification`). A further result
+is a field of these. The order must stay: the phase is estimated without the samples that the
+inspection leaves out, drift is removed before sections are sampled, and errors in the recording are
+refused before a fit.
+
+To find a wrong step, call the functions one by one. Only two things are decided here: if the number
+of multipliers is wrong, look at `_order`, `_order_in_loop` and `_first_that_agrees`; if drift is
+left, or too much is removed, at `_phase_without_drift`.
 """
 
 import dataclasses

@@ -3,7 +3,9 @@ push and the time since the push.
 
 `impulse_responses` computes them from a `SeriesFit`, with standard errors, and returns
 `ImpulseResponses`. The response continues beyond the fitted lags by the recursion from cycle to
-cycle (`whole`). A push is as short as the band of the input allows (`_push`, `_smeared`).
+cycle (`whole`). A push is as short as the band of the input allows (`_push`, `_smeared`). Up to
+`_by_push`, responses have the lag as their first axis, and then the section of the output; only
+`_by_push` turns that into the section of the push.
 
 If responses are shifted in phase or lag, look at `_by_push`, and at `fit.lead` in `pushed`; if they
 have the wrong scale, at `_durations` (the area of a push); if errors are wrong, at `_slopes`.

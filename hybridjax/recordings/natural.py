@@ -12,6 +12,9 @@ has no such bias (instrumental variables, two-stage least squares: Söderström 
 `natural_multipliers` calls `_estimate`: `_moments` computes the products for each cycle and
 section, these are summed with weights (all cycles first, then the draws of the bootstrap,
 `_resampled`), and `_multipliers` gives the result. `_corrected` removes the bias of short records.
+Two things must stay: the order of the fields of `_Moments`, which `_estimate` takes by their place,
+and the row of ones in front of all draws, which gives the estimate itself.
+
 Wrong multipliers have their cause in `_moments` or `_corrected`, wrong intervals in `_resampled`.
 """
 

@@ -1,7 +1,12 @@
 """`select_order`: the number of multipliers that HTFs or data support.
 
 HTFs are compared in `identify/multipliers.py` (`compare_orders`), data on held-out cycles
-(`held_out.py`).
+(`held_out.py`). Only the largest numbers that are tried by default stand here: 5 for HTFs, 4 for
+data. Larger: more time. Smaller: numbers above them are never selected.
+
+If a selected number is wrong, look at `compare_orders` for HTFs, and at `_misfit` in `held_out.py`
+for data. If the warning about numbers that were not tried is needless, look at
+`Split.compare_orders` there.
 """
 
 from typing import overload

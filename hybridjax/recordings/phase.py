@@ -1,9 +1,13 @@
 """`Phase`: the phase of all trials of a recording, as `estimate_phase` returns it.
 
 Each trial has stretches (`Winding`) without long gaps, in which time and phase determine each
-other. `samples` and `by_trial` give data and stretches together. The phase itself is computed in
-`phase_estimation.py`: if a cycle is missing or doubled, look there. If a time between events is
-wrong, look at `Winding.when`, which interpolates.
+other. `samples` and `by_trial` give data and stretches together. Two things must stay, since all
+that counts sections relies on them: the phase is a whole number at section 0, and time and phase of
+a `Winding` increase strictly.
+
+The phase itself is computed in `phase_estimation.py`: if a cycle is missing or doubled, look there.
+If a time between events is wrong, look at `Winding.when`, which interpolates; if the period or its
+jitter is, at `Phase.periods`.
 """
 
 from typing import Any

@@ -1,9 +1,13 @@
 """`estimate_phase`: from a definition of phase to the phase of a recording.
 
 There are three ways: by the angle of two signals (`_from_angles`), by crossings of a smooth signal
-(`_from_crossings`) and by events (`_from_events`); each returns a `Phase`. For events, `_rhythm`
-decides which intervals are too short (doubled events) or too long (missed events): look there if
-cycles are lost or counted twice.
+(`_from_crossings`) and by events (`_from_events`); each returns a `Phase`, which must be a whole
+number at section 0. For events, `_rhythm` decides which intervals are too short (doubled events) or
+too long (missed events): look there if cycles are lost or counted twice.
+
+If section 0 of an angle lies at a wrong place, look at `_angles` (an anchor that is a number) and
+`_angle_at` (a crossing); if an angle is said not to wind, at `_plane`, which chooses the center; if
+pulses of a trigger are lost, at `_is_switched`.
 """
 
 from collections.abc import Sequence

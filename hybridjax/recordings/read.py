@@ -2,7 +2,8 @@
 
 The suffix of a file selects a reader in `formats/` (`read_tables`), which returns tables of
 columns. Here they become a `Recording` with one trial for each file. A reader for another format is
-added in `formats/`, and to the readers here.
+added in `formats/`, and to the readers here. It must not resample: tables of different rates are
+put side by side by `Recording.beside`.
 
 If a file gets the wrong reader, look at `_READERS`; if a signal or its times are wrong, at that
 reader; if events are, at `parse_table` in `formats/columns.py`.

@@ -1,9 +1,13 @@
 """`Recording`: what a laboratory recorded, that is, sampled signals and events with units, in one
 or several trials.
 
-Nothing is resampled or filled in: a missing sample is NaN. The constructor checks the arrays;
-`join` and `beside` combine recordings, and `mark` adds events. Errors about times come from
-`_require_increasing`.
+The constructor checks the arrays; `join` and `beside` combine recordings, and `mark` adds events.
+Two things must stay: nothing is resampled or filled in (a missing sample is NaN), and the columns
+of `Trial.values` have the order of `Recording.signals` in all trials.
+
+Errors about times come from `_require_increasing`, those about events outside of the recording from
+`check_events`. If `mark` misses a crossing, look at `known` there, which leaves out gaps, and at
+the bandwidth; if samples are at wrong times after `beside`, look at `_beside`.
 """
 
 import inspect
@@ -39,7 +43,7 @@ from .formats.columns import (
 from .smoothing import Bandwidth, Series, bridgeable, spline, without_spikes
 
 
-# Trials that an error names. More: it is longer than a line.
+# Trials that an error names. More: it is longer than a line. Fewer: times of others are hidden.
 _NAMED = 3
 
 

@@ -5,8 +5,13 @@ the removal of slow drift.
 left out, splines through the outputs are evaluated where the phase crosses a section (`_Output`),
 inputs become one value for each interval between sections (`_held`), and the average cycle is
 subtracted. `_records` then makes a record of each stretch of the phase, and the result is a
-`SectionData`. A wrong output has its cause in `_Output`, an input that is shifted by a section in
-`_held`.
+`SectionData`. The order must stay: a spike must not reach a spline, and the average cycle is that
+of all stretches of a trial. In arrays, inputs stand first, then outputs, and times of crossing
+last.
+
+A wrong output has its cause in `_Output`, an input that is shifted by a section in `_held`, a wrong
+time of crossing in `_with_times`, and NaN where there are samples in `_long_gaps`. If data are
+refused without need, look at `_require_changes` and `_require_times`.
 """
 
 from collections.abc import Sequence

@@ -2,7 +2,8 @@
 
 All files of `recordings` that evaluate a signal between its samples call `spline` (or `means`), and
 ask `bridgeable` and `gaps` which gaps are too long. `spike_heights` finds isolated wrong samples.
-Time series are arrays (n,), with NaN for missing samples.
+Time series are arrays (n,), with NaN for missing samples. `gaps` must include what lies before and
+after all samples: by it callers leave out what a spline would extrapolate.
 
 The constants say what counts as a spike. If a good sample is left out or a spike stays in, look at
 `spike_heights` (and `input_spikes` for inputs), which tests each condition in turn; if a signal is

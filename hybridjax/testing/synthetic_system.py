@@ -1,10 +1,17 @@
-"""A made-up periodic system whose dimension varies, to try things on."""
+"""A made-up periodic system whose dimension varies, to try things on.
+
+Tests of models, designs, fits and figures call `synthetic_ldtp`, and some rely on its numbers,
+which must therefore stay. For another system, call `LDTP.from_blocks` with other matrices. If its
+multipliers are not those of the docstring below, look at `LDTP.from_blocks` and at
+`LDTP.multipliers` (`linear/ldtp.py`): here nothing is computed.
+"""
 
 import numpy as np
 
 from ..linear.ldtp import LDTP
 
 
+# The matrices of each section, in the order of the arguments of `LDTP.from_blocks`.
 _BLOCKS = {
     "A": (
         ((0.5, -0.3, 0.2), (0.4, 0.6, -0.1)),

@@ -10,8 +10,12 @@ walk if $\theta$ is longer than the trial. Its parameters maximize the restricte
 Time Series Models and the Kalman Filter*, 1989).
 
 `estimation.py` calls `estimate_wander` with residuals of durations, and `whitening` to make errors
-independent (`Whitening`). A wrong standard error of a curve under slow inputs has its cause in
-`estimate_wander`.
+independent (`Whitening`). Intervals must be in the order of time, trial by trial, since the filter
+passes from each to the next (`_left` is zero at the end of a trial).
+
+A wrong standard error of a curve under slow inputs has its cause in `estimate_wander`. If errors
+are still correlated, look at `_filters`; if a wandering rate is found without need, look at
+`_LEAST_GAIN` and `_improbable`.
 """
 
 from typing import NamedTuple

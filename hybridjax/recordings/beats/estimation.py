@@ -13,8 +13,12 @@ errors over blocks still have a larger variance, the likelihood uses this varian
 (quasi-likelihood: McCullagh 1983).
 
 `response.py` calls `fit_curve` (jitter, smoothness, wander and curve in turn, until they do not
-change; the curve in `_minimize`), `accuracy_of` (its covariance) and `carried_over`. A curve that
-is too flat has its cause in `_smoothness`, a standard error in `accuracy_of`.
+change; the curve in `_minimize`), `accuracy_of` (its covariance) and `carried_over`. The last
+column of `Forecast.slopes` must stay the derivative by the rate: functions here split it off.
+
+A curve that is too flat has its cause in `_smoothness`, a wrong standard error in `accuracy_of`, a
+fit that does not converge in `_minimize`, and an interval that is needlessly left out in
+`CurveFit.counted`.
 """
 
 from typing import NamedTuple
@@ -324,6 +328,8 @@ def _smoothness(intervals: Intervals, fit: CurveFit) -> Smoothness:
     by_first = np.outer(share, curvature[0, 1:])
     inner = curvature[1:, 1:] - by_first
     pull = score[1:] - share * score[0]
+    # In the axes of `gain`, the likelihood of tau is a sum. `gain` is the information of the data
+    # along each axis, and `power` the square of the score, both in units of the noise.
     pairs = np.outer(weight, weight)
     gain, axes = np.linalg.eigh(inner / np.sqrt(pairs))
     unit = max(noise, _TINY)

@@ -5,8 +5,13 @@ $$\dot\varphi = w + Z(\varphi)\, I(t), \qquad \varphi = 0 \text{ at an event}, \
 
 The end of an interval depends on the input. So the equation is integrated until the phase is 1, and
 not until the measured end, whose noise would enter the regressors. `estimation.py` and
-`response.py` call `intervals_of` (data) and `forecast` (durations and their derivatives). If
-durations are wrong, look at `_PhaseModel.integrate`.
+`response.py` call `intervals_of` (data) and `forecast` (durations and their derivatives). Inputs
+are given at half steps, as the Runge-Kutta method needs them, and the last of the derivatives is
+the one by the rate: both must stay.
+
+If durations are wrong, look at `_PhaseModel.integrate`; if a fit takes wrong steps, at
+`_PhaseModel._derivatives`; if intervals are lost, at `_of_trial`, which leaves out those with gaps
+of the input.
 
 Noise in the rhythm spreads the phase: after a part $\varphi$ of the cycle its variance is $s^2
 \varphi$, with s the standard deviation at the end. The curve averaged over that distribution acts

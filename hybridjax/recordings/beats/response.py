@@ -1,9 +1,9 @@
 """`phase_response`: the phase response curve of a rhythm, from the times of its events under a
 known input.
 
-It fits a flat curve, then a smooth one (`estimation.py`), and returns a `PhaseResponse`. The phase
-model that forecasts intervals between events is in `model.py`, and the model of their errors in
-`errors.py`.
+It fits a flat curve, then a smooth one (`estimation.py`), and returns a `PhaseResponse`. The order
+must stay, since the smooth fit starts from the flat one. The phase model that forecasts intervals
+between events is in `model.py`, and the model of their errors in `errors.py`.
 
 If a curve is wrong, look at `estimation.py`; if forecasts are, at `PhaseResponse.forecast`; if
 intervals are lost or counted twice, at `_intervals` and `intervals_of` (`model.py`).

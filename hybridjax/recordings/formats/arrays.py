@@ -3,6 +3,8 @@ table (Parquet, Feather, Excel).
 
 `read.py` calls a function `read_...` by the suffix of a file; each returns tables of `Columns`
 (`columns.py`). In files with groups, `_read_tree` decides which array holds the times of a signal.
+Where a reader calls `check_declared`, that must stay before values are read: a damaged file could
+otherwise take all memory.
 
 If a signal has wrong times, look at `_nearest`; if a number is scaled wrongly or not marked as
 missing, at `Leaf.values` (packing and marks of NetCDF); if a matrix is read along the wrong axis,

@@ -1,6 +1,12 @@
 """Reader of bags of ROS 1 and ROS 2, and of MCAP files with messages of ROS.
 
-`read.py` calls `read_bag`, which returns one table of `Columns` for each wanted topic.
+`read.py` calls `read_bag`, which returns one table of `Columns` for each wanted topic. The package
+rosbags decodes the messages, and only those of wanted topics: others, such as images, may be large.
+All messages of a topic must give the same names, since each becomes one row.
+
+If a field is missing, look at `_numbers`; if times are wrong, at `_Topic.columns`, which takes the
+stamps in headers, or else the times of arrival; if a bag is refused without need, at `check_rows`
+(`columns.py`), which compares the number of messages with the index, and at `_Topic.add`.
 """
 
 import dataclasses
@@ -68,6 +74,10 @@ class _Topic:
         self.arrivals = array("q")
 
     def add(self, path: Path, message: Any, arrival: int, wanted: Wanted) -> None:
+        """Take the wanted numbers of a message, which arrived at this time (ns).
+
+        **Raises:** `FileFormatError` if their names differ from those of earlier messages.
+        """
         numbers = {
             name: value
             for name, value in _numbers(message, self.name)

@@ -90,6 +90,7 @@ class _Header(NamedTuple):
 
 
 def _read_header(path: Path) -> _Header:
+    """Read the first 18 bytes of a file, in the order of bytes that its parameters state."""
     with open(path, "rb") as file:
         head = file.read(18)
         first_block_of_parameters = head[0]
@@ -151,6 +152,7 @@ def _points(
 
 
 def _analogs(parameters: Mapping[str, Any], channels: Rows) -> Named:
+    """Return the analog channels that have a label, with their units."""
     labels = _texts(parameters, "LABELS")
     units = _texts(parameters, "UNITS")
     names = zip_longest(labels, units[: len(labels)], fillvalue="")

@@ -2,7 +2,12 @@
 
 `read.py` calls `read_text`, which returns tables of `Columns`. It recognizes a layout by its first
 lines; fields and numbers are read in `text.py`. To add a layout, write a function here that returns
-its tables, and call it in `read_text`.
+its tables, and call it in `read_text`, before `read_plain`, which takes every other file. Numbers
+of lines here are those of the layouts, not settings.
+
+If a file is read in a wrong layout, look at `read_text`; if a column of Vicon has a wrong name or
+unit, at `_names`; if its times are wrong, at `_place`. A file whose number of rows is not that in
+its header is refused by `check_rows` (`columns.py`).
 """
 
 from collections.abc import Iterator

@@ -8,7 +8,8 @@ their flags, sizes and names; members of structs and cells are arrays in them. A
 holds one array (MAT-File Format, The MathWorks 2020, Ch. 1).
 
 If a good file is refused, look at `_array`, which reads the headers of all members, and at
-`_MEMBER`. All other numbers above, but `_PIECE`, are those of the format and must not be changed.
+`_MEMBER`; if a large one is not refused, at `check_declared` in `columns.py`, which has the limit.
+All other numbers below, but `_PIECE`, are those of the format and must not be changed.
 """
 
 import math

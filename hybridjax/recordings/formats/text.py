@@ -1,9 +1,12 @@
 """Tables in text files: encodings, separators, names, units, numbers.
 
 `layouts.py` calls `read_lines` for the lines of a file, and `read_plain` (a file without a special
-layout) or `read_table` (numbers from a given line on), which return `Columns`. A number that is
-misread has its cause in `_by_line` or `_numbers_alone`, a wrong name in `_separator` or
-`_from_names`.
+layout) or `read_table` (numbers from a given line on), which return `Columns`. `_numbers_alone`
+reads tables of numbers fast; `_by_line` reads all others, must give the same numbers, and is the
+one that finds the line of an error. Further marks of missing samples are added to `_MISSING`.
+
+A number that is misread has its cause in `_by_line` or `_numbers_alone`, a wrong name in
+`_separator` or `_from_names`, a wrong unit in `_are_units`, a wrong letter in `read_lines`.
 """
 
 import codecs

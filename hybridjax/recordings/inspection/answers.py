@@ -7,7 +7,9 @@ an input within one part of a recording, and its *gain* the ratio of the actual 
 response.
 
 If an input is reported without need, look at the prediction in `_answers`; if events are, at
-`inexact_events` and `_SHIFTED`. The constants say when a gain is odd.
+`inexact_events` and `_SHIFTED`; if feedback is, at the limits in `feedback`. The constants say when
+a gain is odd. A part must be predicted from other parts only (`training`): a part that predicts
+itself seems to answer.
 """
 
 from collections.abc import Iterator, Sequence

@@ -4,7 +4,9 @@
 function. Those that compare trials (`other_settings`, `clocks`, `other_cycles`) compare a number of
 one trial (range, period, correlation of average cycles) with the median of the other trials. Those
 that look into each trial are `coarse_stamps`, `odd_cycles`, `alternating_cycles` and
-`slow_changes`. The constants are their limits: change these if a finding is missed or needless.
+`slow_changes`. The constants are their limits: change these if a finding is missed or needless. If
+a trial gets a wrong reason, look at the order of the reasons in `_difference`, which must stay: the
+first that fits is reported.
 """
 
 import itertools

@@ -1,9 +1,11 @@
 """Find samples that were not measured: placeholders, frozen, clipped and wrapped signals, copies.
 
 `inspect.py` calls the functions without underscore. `placeholders`, `frozen` and `repeated_rows`
-return masks of samples, which are then left out; the others yield findings. The constants are their
-limits: if good samples are left out, or a failure passes, look at those of the function whose title
-the finding has.
+return masks of samples, which are then left out; the others yield findings. `placeholders` and
+`frozen` must take the same arguments, since `inspect.py` calls both in one loop.
+
+The constants are the limits: if good samples are left out, or a failure passes, look at those of
+the function whose title the finding has.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,7 +3,13 @@
 It calls the tests in `failures.py`, `differences.py` and `answers.py`, and returns an `Inspection`:
 findings, and the recording without samples that were certainly not measured. `inspect_cycles` runs
 the tests that need the phase and the data at the sections. A new test is a function in one of these
-files, and a line here.
+files, and a line here; one that leaves samples of a signal out is an entry of `_NOT_MEASURED` and
+of `_TEXTS`. The order must stay: samples that were not measured are left out before trials are
+compared, since they would change what is compared.
+
+If a finding is missed or needless, look at its function in these files. If a resting signal is
+taken for frozen, look also at `_samples_per_cycle`, by which `frozen` judges; if a trial is left
+out, at `_trials_with_samples`.
 """
 
 from collections.abc import Sequence

@@ -14,6 +14,9 @@ Human Brain Mapping 15, 2002). The draws are
 - subjects with replacement, where values are skewed: the studentized bootstrap (Hall, *The
   Bootstrap and Edgeworth Expansion*, 1992), whose bands are wider.
 
+The first flip or rotation must stay the one that changes nothing: in tests of differences it stands
+for the measured maps, without which p-values would be too small.
+
 If a band is too narrow or a p-value too small, look at `_largest` and the weights of the draws
 (`flips`, `_rotations`, `_resampled`); if the wrong kind of draws is used, at `_are_skewed`.
 """

@@ -3,8 +3,11 @@ over subjects.
 
 A mean or a difference takes three stages: trials of a subject are merged (`_trials`, `_merged`),
 the means are fitted (`reml.py`), and contrasts of them become rows of a table (`_effects`). Checks
-of the subjects' table are in `tables.py`. A wrong mean or error has its cause in `reml.py`; a wrong
-number of subjects, in `_merged`.
+of the subjects' table are in `tables.py`. The names of the columns of results must stay: the
+figures of `plot/subjects.py` read them.
+
+A wrong mean or error has its cause in `reml.py`; a wrong number of subjects, in `_merged`; a wrong
+sign or weight of a difference, in `_contrast`; a wrong power, in `_test`, which simulates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -445,6 +448,10 @@ class Population(Showable):
         )
 
     def _numbers(self, name: str) -> np.ndarray:
+        """Return a column of the table (rows,).
+
+        **Raises:** `DefinitionError` if it does not exist, or does not hold numbers alone.
+        """
         values = np.asarray(self.table.get(name, ""))
         if values.dtype.kind not in "iuf" or not np.isfinite(values).all():
             raise DefinitionError(
@@ -491,6 +498,10 @@ class Population(Showable):
         return data.assign(y=data["wy"] / data["w"], v=1 / data["w"])
 
     def _cells(self, quantity: str, needed: int, covariates: Sequence[str] = ()) -> Any:
+        """Return the label and the merged estimates of each cell (group and condition).
+
+        **Raises:** `DefinitionError` for a cell with fewer subjects than `needed`.
+        """
         merged = self._merged(quantity, covariates)
         cells = dict(list(merged.groupby("cell", sort=False)))
         subjects = {cell: data["subject"] for cell, data in cells.items()}

@@ -11,7 +11,8 @@ models of other libraries estimate one variance of all errors instead.
 
 `population.py` calls `mixed` (several groups or conditions) or `meta` (one estimate for each
 subject), and gets a `Mixed`, whose `contrast` gives differences. `moderated` first reduces the
-scatter of variances from few blocks.
+scatter of variances from few blocks. In all functions, `v` are variances, not standard errors;
+`mixed` takes cells numbered from 0 on, in the order of the rows of Psi.
 
 If a mean or the spread between subjects is wrong, look at `mixed`. If only the error of a mean is,
 look at the covariance there, or at that of `meta`; if its degrees of freedom are, at

@@ -1,7 +1,12 @@
 """Tables of a study as data frames: the subjects with their groups and conditions.
 
 `Population` and `PopulationMaps` call `table_of` to check a table, `cells_of` and `rows_with` to
-select rows, and `signed` for the sentences of a methods section.
+select rows, and `signed` for the sentences of a methods section. A *factor* is the column `group`
+or `condition`, and a *cell* is one group and condition, by its labels. The names `subject`, `group`
+and `condition` must stay, since users write them. From `table_of` on, labels are strings.
+
+If a table is refused without need, look at `table_of`; if labels are, at `rows_with`; if subjects
+are said to be too few, at `require` and its callers.
 """
 
 from collections.abc import Iterable, Mapping
