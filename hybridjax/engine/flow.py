@@ -5,7 +5,8 @@ states at given times, differentiable.
 those of a search, and derivatives are those of a replay of the tape (the record of the search's
 steps); `_passed_jvp` joins the two. Here, `_events` and `_samples` also read
 events and states at given times from the tape. If an event or a sample is wrong and the end of the
-flow is right, look in these two.
+flow is right, look in these two; if an end is wrong, in the search or in `replay.py`. The order of
+the numbers that `repeat` returns must stay that of `_with_values`, which puts them in their places.
 """
 
 import functools as ft
