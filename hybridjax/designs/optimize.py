@@ -5,6 +5,11 @@ goal (`criteria.py`), limits (`limits.py`), the best powers (`allocation.allocat
 matter and their division into experiments (`worthwhile`, `to_design`), and phases within the peaks
 (`Rules`). It returns an `OptimalDesign` with a certificate. The certificate tells whether the
 powers are best; standard errors come from the criterion.
+
+The order must stay: the usual design is scaled to the limits before its noise and the criterion are
+computed, and peaks come last, since they depend on the phases. If a limit is exceeded, look at
+`Rules.scaled` and `Rules.below_peaks`; if a certificate is far above 1, at `allocation.py` (with
+limits of peaks or distortion, it may be so at the optimum).
 """
 
 import dataclasses
