@@ -5,8 +5,8 @@ Users make a goal and give it to `optimal_design`. A goal has data only; its cri
 `criteria.py`. A new goal is a class here, a member of `Goal`, and a branch of `criterion_of` there.
 
 `__check_init__` refuses what is wrong without a model; what does not fit a model is refused in
-`criteria.py` and `matrices.py`. There, too, is the cause of a wrong standard error. The default
-harmonics of a goal must be those with which its estimator will be called.
+`criteria.py` and `matrices.py`. There, too, is the cause of a wrong standard error. Harmonics of a
+goal are those that its estimator will get: standard errors hold for these only.
 """
 
 from typing import Literal
