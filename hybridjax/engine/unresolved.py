@@ -140,6 +140,7 @@ def _passing(
     """Test which steps in chart a, given by the rows at which they begin, pass over a pulse of each
     rate, gain and guard: the polynomial through eight of its values in the step misses the
     pulse."""
+    # What the polynomials miss, in parts that fit into memory. Columns: n rates, then gains.
     s = path.structure
     n = s.dims[a]
     m = n * (1 + s.nu)
@@ -171,6 +172,7 @@ def _passing(
         parts.append(part)
     whole = _Part(*map(np.concatenate, zip(*parts, strict=True)))
 
+    # What they may miss, relative to the magnitudes of all steps.
     accuracy = np.max(np.asarray(settings.rtol))
     if settings.scale is None:
         usual = np.abs(path.after[rows]).max(axis=0)
