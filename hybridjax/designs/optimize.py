@@ -333,6 +333,7 @@ def optimal_design(
     else:
         usual = design
     _check_alike(models, usual)
+    # Limits of the powers of all cosines.
     given = as_limits(limit)
     cosines = Candidates.of(usual)
     squares = [mean_squares(each, cosines) for each in models]
@@ -354,6 +355,7 @@ def optimal_design(
         peak=dict(given.peak),
         seed=seed,
     )
+    # The usual design within these limits, and the criterion.
     usual = rules.below_peaks(rules.scaled(usual))
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
@@ -362,6 +364,7 @@ def optimal_design(
     errors = make_noise(models[0], noise, usual_rms)
     criterion = criterion_of(goal, models, cosines, errors, usual_power, robust)
 
+    # The best powers: of all cosines, then of those that matter. Then experiments with these.
     before = criterion.bound(usual_power)
     ideal = allocate(criterion, limits, usual_power)
     kept = worthwhile(cosines, ideal.power * ideal.bound.sensitivity, count)
@@ -369,6 +372,7 @@ def optimal_design(
     use = best.power * limits.only(kept).share(best.power)
     made = to_design(cosines.only(kept), best.power, use, count, usual, seed)
     made = rules.below_peaks(rules.less_distorted(criterion, made))
+    # What these experiments reach. (The bound supposes as many experiments as `usual` has.)
     power = cosines.power_of(made)
     after = criterion.only(kept).bound(power[kept])
     shorter = usual.experiments / count
