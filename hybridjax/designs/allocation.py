@@ -14,7 +14,9 @@ limits $\Psi(q) \ge \Psi(p) / e$ with $e = \max_q \sum_k q_k s_k / \sum_k p_k s_
 
 `optimize.py` calls `allocate` (the iteration over powers), `certify` (e), `worthwhile` (which
 cosines matter) and `to_design` (their division into experiments). If designs are poor, look first
-at the certificate: it is near 1 if `allocate` is right.
+at the certificate: it is near 1 if `allocate` is right. If powers are right and experiments are
+not, look at `worthwhile` (lines that are missing), at `_dealt`, or at `_balanced` (experiments of
+different power). An experiment must keep at most one line of each class.
 """
 
 from typing import NamedTuple

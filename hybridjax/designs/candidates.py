@@ -4,6 +4,11 @@ their measurement (`Noise`, `Measured`).
 All other files of `designs` use `Candidates`. `mean_squares` gives the power of each signal per
 unit of power of each cosine, for limits; `measured_htfs` gives the HTFs with their variances, for
 criteria. `draw_models` is public: models from the confidence region of an estimate.
+
+The order of the cosines (by line, then by input) must stay: powers, limits and criteria are arrays
+in this order. If all standard errors are wrong by one factor, look at `measured_htfs` and
+`make_noise`; if a limit holds for another rms than predicted, at `mean_squares`; if a design is
+refused, at `Candidates.of`.
 """
 
 import dataclasses

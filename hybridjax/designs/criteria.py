@@ -80,6 +80,7 @@ def _multipliers(
     noise: Noise,
     power: Powers,
 ) -> LinearCriterion:
+    """Return the criterion of multipliers, as the estimator of the goal estimates them."""
     multipliers = np.asarray(model.multipliers)
     if goal.estimator == "fit_ldtp":
         matrices = ldtp_matrices(model, cosines, goal.harmonics, noise, power)
@@ -159,6 +160,7 @@ def _parameters(
     lines: Candidates,
     noise: Noise,
 ) -> LinearCriterion:
+    """Return the criterion of the relative errors of physical parameters."""
     free = tuple(goal.free)
     wanted = free if goal.quantities is None else tuple(goal.quantities)
     require_among("free parameter", wanted, free, "`quantities` of `goal`: ")

@@ -12,7 +12,9 @@ nearly the largest one: it is smaller by a factor of $J^{-1/r}$ at most.
 
 The search calls `Criterion.bound(power)`, which returns a `Bound`: variances, sensitivities and the
 criterion. If the sensitivities are not the derivatives of the criterion, the search fails: test
-these first.
+these first. If an unknown is refused that the data determine, look at `_root`; if variances are too
+large, at `Channel.rows`, which takes out what numerators explain. A new criterion must be convex
+and halved by twice the powers, too.
 """
 
 import dataclasses
@@ -93,6 +95,7 @@ class LinearCriterion(eqx.Module):
         )
 
     def bound(self, power: Powers) -> Bound:
+        """Return the bound of this model with these powers; see `Criterion.bound`."""
         d = len(self.unknowns)
         rows = np.concatenate(
             [channel.rows(power, d) for channel in self.channels], axis=1

@@ -2,7 +2,11 @@
 responses in a band.
 
 Users make a goal and give it to `optimal_design`. A goal has data only; its criterion is in
-`criteria.py`.
+`criteria.py`. A new goal is a class here, a member of `Goal`, and a branch of `criterion_of` there.
+
+`__check_init__` refuses what is wrong without a model; what does not fit a model is refused in
+`criteria.py` and `matrices.py`. There, too, is the cause of a wrong standard error. Harmonics of a
+goal are those that its estimator will get: standard errors hold for these only.
 """
 
 from typing import Literal

@@ -5,7 +5,8 @@ r"""Criteria of `fit_ldtp`, whose unknowns are the matrices of a linear periodic
 Combinations that the usual design does not determine are left out.
 
 If bounds are too small, look at the combinations that were left out (`_MISSED`); if they are wrong,
-compare `_rows` with differences of the HTFs.
+compare `_rows` with differences of the HTFs. If a goal is refused as not determined, look at
+`Matrices.criterion`. The coordinates must stay those of `fit_ldtp`, of which these are the bounds.
 """
 
 import itertools

@@ -5,6 +5,11 @@ goal (`criteria.py`), limits (`limits.py`), the best powers (`allocation.allocat
 matter and their division into experiments (`worthwhile`, `to_design`), and phases within the peaks
 (`Rules`). It returns an `OptimalDesign` with a certificate. The certificate tells whether the
 powers are best; standard errors come from the criterion.
+
+The order must stay: the usual design is scaled to the limits before its noise and the criterion are
+computed, and peaks come last, since they depend on the phases. If a limit is exceeded, look at
+`Rules.scaled` and `Rules.below_peaks`; if a certificate is far above 1, at `allocation.py` (with
+limits of peaks or distortion, it may be so at the optimum).
 """
 
 import dataclasses
@@ -328,6 +333,7 @@ def optimal_design(
     else:
         usual = design
     _check_alike(models, usual)
+    # Limits of the powers of all cosines.
     given = as_limits(limit)
     cosines = Candidates.of(usual)
     squares = [mean_squares(each, cosines) for each in models]
@@ -349,6 +355,7 @@ def optimal_design(
         peak=dict(given.peak),
         seed=seed,
     )
+    # The usual design within these limits, and the criterion.
     usual = rules.below_peaks(rules.scaled(usual))
     usual_power = cosines.power_of(usual)
     shown = [*models[0].inputs, *models[0].outputs]
@@ -357,6 +364,7 @@ def optimal_design(
     errors = make_noise(models[0], noise, usual_rms)
     criterion = criterion_of(goal, models, cosines, errors, usual_power, robust)
 
+    # The best powers: of all cosines, then of those that matter. Then experiments with these.
     before = criterion.bound(usual_power)
     ideal = allocate(criterion, limits, usual_power)
     kept = worthwhile(cosines, ideal.power * ideal.bound.sensitivity, count)
@@ -364,6 +372,7 @@ def optimal_design(
     use = best.power * limits.only(kept).share(best.power)
     made = to_design(cosines.only(kept), best.power, use, count, usual, seed)
     made = rules.below_peaks(rules.less_distorted(criterion, made))
+    # What these experiments reach. (The bound supposes as many experiments as `usual` has.)
     power = cosines.power_of(made)
     after = criterion.only(kept).bound(power[kept])
     shorter = usual.experiments / count

@@ -2,8 +2,9 @@
 
 A study has no model at first: `design` is the next block, and `add(data)` returns the study with
 the estimate from all blocks (`study_estimate.py`) and the optimal design for the missing cycles
-(`_next`). Studies are immutable. A study that never ends has its cause in `_suffices` or
-`_refuse_surplus`.
+(`_next`). Studies are immutable, and must depend on their arguments and blocks only. A study that
+never ends has its cause in `_suffices` or `_refuse_surplus`, a block that is too long or too short
+in `_next`. Data that are refused: see `_with_block`, `_require_supported` and `refuse_transient`.
 """
 
 import dataclasses

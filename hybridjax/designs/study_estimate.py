@@ -3,7 +3,9 @@
 `study.py` calls `block_of` for new data, `refuse_transient`, and `estimate` for all blocks
 together, which returns an `Estimate`: the fit, the noise of each block, and an objection if the fit
 cannot be used. The noise is estimated in turns with the fit: a wrong weight has its cause in this
-loop.
+loop. If good data are refused, look at `refuse_transient`; if a good fit is rejected, at
+`_objection`. That the larger one of two standard errors counts must stay: the study stops when
+errors are small, and so it would stop at one that is too small by chance.
 """
 
 import dataclasses

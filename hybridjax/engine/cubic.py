@@ -5,7 +5,8 @@ step, and gets the first crossing as a fraction of the step. The interpolant is 
 into at most three monotone pieces, so that the first crossing is also found where the guard dips
 below zero and returns within the step. `search/attempt.py` calls `bounds` to see that a guard stays
 away from zero. An event that the search misses or invents has its cause in these two functions.
-`dips` is the test of a trajectory that follows an itinerary.
+`dips` is the test of a trajectory that follows an itinerary. Slopes `d0` and `d1` must be per step
+(a rate times the step's length), and a crossing is a zero at which the guard falls.
 """
 
 from typing import NamedTuple
@@ -244,6 +245,7 @@ def bounds(v0, v1, d0, d1, margin) -> tuple[Array, Array]:
 
 
 def _divide(a, b):
+    """Return a / b, and infinity where b is zero."""
     xp = namespace(b)
     divisor = xp.where(b == 0, 1.0, b)
     return xp.where(b == 0, xp.inf, a / divisor)

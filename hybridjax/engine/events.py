@@ -3,8 +3,10 @@
 A guard is *armed* if its next fall through zero is an event. The search calls these functions:
 `arm` at the start of a flow, `rearm` and `apply_resets` at an event, `next_schedule` before each
 step and `keep_pace` after it. All take lanes (trajectories side by side), and return arrays of the
-same lanes. An event that happens twice, or not at all after a reset, has its cause in `rearm`.
-Derivatives across an event (saltation) are computed in `watch.ChartFlow.locate` and `replay.py`.
+same lanes. An event that happens twice, or not at all after a reset, has its cause in `rearm` (a
+scheduled one in `await_schedules` or `_over`); Zeno that is reported without need, in `keep_pace`.
+`itinerary/flags.py` repeats the rule of `rearm`: both must stay the same. Derivatives across an
+event (saltation) are computed in `watch.ChartFlow.locate` and `replay.py`.
 """
 
 import itertools

@@ -5,7 +5,8 @@ states at given times, differentiable.
 those of a search, and derivatives are those of a replay of the tape (the record of the search's
 steps); `_passed_jvp` joins the two. Here, `_events` and `_samples` also read
 events and states at given times from the tape. If an event or a sample is wrong and the end of the
-flow is right, look in these two.
+flow is right, look in these two; if an end is wrong, in the search or in `replay.py`. The order of
+the numbers that `repeat` returns must stay that of `_with_values`, which puts them in their places.
 """
 
 import functools as ft
@@ -104,6 +105,7 @@ def pass_through(
 def _passed(
     s, lanes, u, target, times, settings, options, most_events, result
 ) -> Passage:
+    """The values of `pass_through`: those of a search."""
     moved, tape = _recorded(s, lanes, u, target, settings, options, result)
     ways = Ways(tape.t, tape.before, tape.after)
     samples = _samples(s, lanes, u, tape, ways, times)
@@ -112,6 +114,7 @@ def _passed(
 
 @_passed.def_jvp
 def _passed_jvp(primals, tangents):
+    """The same with derivatives: the search carries none, and its tape is replayed with them."""
     s, lanes, u, target, times, settings, options, most_events, result = primals
     still_s, still_lanes, still_u, still_target = fixed((s, lanes, u, target))
     with_tangents = options._replace(tangents=True)
@@ -231,6 +234,7 @@ def _before(lanes: Lanes, tape: Tape, ways: Ways, times: Float[Array, "K L"]) ->
 
 
 def _recorded(s, lanes, u, target, settings, options, result) -> tuple[Moved, Tape]:
+    """Search from a cautious first step; return the lanes at their targets, and the tape."""
     longest = target.limit - lanes.t
     first = initial_step(s, lanes, u, longest, settings)
     setout = fixed(stride(first))

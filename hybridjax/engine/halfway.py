@@ -5,6 +5,11 @@ interpolant of a step uses the ends of the step only. The state halfway, which t
 without a further evaluation of the field, tells how far the solution is from that cubic. The
 weights satisfy the order conditions at half the step (E. Hairer, S. P. Norsett and G. Wanner,
 Solving Ordinary Differential Equations I, section II.6).
+
+No state at the end of a step depends on these weights, only the margins of watched functions
+(`_margin` in `search/attempt.py`). If steps are halved in vain or events are missed with one method
+only, look at `_weights`: the limits below decide which order is used. The conditions of lower
+orders must stay exact, so that the error vanishes for short steps.
 """
 
 import functools as ft

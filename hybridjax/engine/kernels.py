@@ -337,6 +337,8 @@ class Tangents(Structure):
         return np.concatenate([still, along])
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
+        """As that of a `Structure`, for complex times and states: the imaginary part of the answer
+        is the derivative along the direction of each lane, times `TINY`."""
         moving = (0, 1, 3) if isinstance(form, _ByMethod) else (0, 1)
 
         def make():
@@ -386,12 +388,14 @@ class Systems(Structure):
         self._single = Structure(from_host(single))
 
     def at(self, lane):
+        """The systems of these lanes."""
         other = copy.copy(self)
         other._made = {}
         other._numbers = self._numbers[:, lane]
         return other
 
     def kernel(self, function, form, *static, trees=(), lanes=1):
+        """As that of a `Structure`, where each lane has the parameters of its own system."""
         every = self._single, *trees
 
         def make():
@@ -493,6 +497,8 @@ class _ByMethod(NamedTuple):
 
 
 def _step(method: Method, field: Callable, t, q, u, h, *x):
+    """The fields of a `Step`, stacked on the first axis."""
+
     def at(t, q):
         return field(t, q, u, h, *x)
 
@@ -501,6 +507,9 @@ def _step(method: Method, field: Callable, t, q, u, h, *x):
 
 
 def _step_along(method: Method, field: Callable, t, q, u, h, along):
+    """The fields of a `Step`, and the derivatives of its end and estimate along a direction of
+    states, stacked on the first axis."""
+
     def at(t, q):
         return field(t, q, u, h, along)
 

@@ -9,8 +9,10 @@ must not be evaluated at the states of another chart:
 - `needed` stops derivatives where a chart has no lane.
 - `nan_where` marks lanes that failed, in values and derivatives.
 
-If values are right and derivatives are NaN, look in these three. (`_core/lanes.py` turns functions
-of single states into functions of lanes.)
+If values are right and derivatives are NaN, look in these three. If pieces of a flow are joined in
+a wrong way, look in `regrouped`, `side_by_side` and `stack_rows`. Lanes must stay on the last axis
+of all arrays, and codes of events must stay indices of transitions (all others are negative).
+(`_core/lanes.py` turns functions of single states into functions of lanes.)
 """
 
 from collections.abc import Callable

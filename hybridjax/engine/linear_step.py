@@ -6,6 +6,11 @@ c_i h, x_i, u)$. The derivatives of the stages by t, q, u and h follow from the 
 field, one stage after the other (`_explicit`). The compiled derivative of the field exists already,
 so that nothing more is compiled. A step of an implicit method is differentiated by JAX, in a
 compiled function of its own (`kernels.linear_step`).
+
+The columns of the answer must stay in their order, since `replay._after_steps` takes them by their
+places: the end, the field there, then the derivatives. If derivatives of explicit steps are wrong,
+compare `_explicit` with `kernels.linear_step`, which must give the same numbers. Stages are
+computed in `_rate`, and their sums in `_state`.
 """
 
 import numpy as np
@@ -34,6 +39,8 @@ def linear_step(
 
 
 def _explicit(method: Method, s: Structure, a: int, t, q, u, h):
+    """The same as `linear_step` for an explicit method. (Arrays of the stages have the M steps
+    first, then the states.)"""
     n, M = q.shape
     m = 1 + n + s.nu + 1  # by time, states, inputs and length of the step
     stages = len(method.b)

@@ -111,6 +111,8 @@ def through(
 
 
 def _pieces(static: tuple, s, levels, settings, ends, begin, u, patience):
+    """The pieces of `through`, as a loop. `ends` has the fields of the targets that differ from one
+    piece to the next; `static` has those that do not, and the function that makes a piece."""
     flow, options, missed, sequence = static
 
     def piece(carry, end):
@@ -169,6 +171,7 @@ def _move(s, lanes, u, target, setout, result, settings, options: Options) -> Re
 
 @_move.def_jvp
 def _move_jvp(primals, tangents):
+    """Search without derivatives, with steps that suit derivatives, and replay its tape."""
     s, lanes, u, target, setout, result, settings, options = primals
     taped = options._replace(tape=True, tangents=True)
     still = fixed((s, lanes, u, target, setout))
@@ -186,6 +189,7 @@ def follow(s, lanes, u, target, recorded: Recorded) -> Recorded:
 
 
 def _follow_jvp(primals, tangents):
+    """Times and states at the end with their derivatives, by a replay. All else has none."""
     s, lanes, u, target, recorded = primals
     target, levels = target.split()
 

@@ -16,7 +16,9 @@ whose derivatives are those of the formula in `saltation.py`.
 
 A wrong derivative has its cause in a single move: compare `linear_moves` with differences of the
 three stages `_after_steps`, `_at_zeros` and `_after_resets`. If single moves are right, the order
-of the moves is wrong, which `recorded_moves` reads from the tape.
+of the moves is wrong, which `recorded_moves` reads from the tape. `_replayed` and `linear_moves`
+must treat each code of a move alike (known times, ticks of clocks, zeros, events at once): a change
+of one is due in the other.
 """
 
 import dataclasses

@@ -88,6 +88,8 @@ def take_step(
 
 
 def _looped_stages(method, field, t, q, h) -> Float[Array, "stages n L"]:
+    """The rates of all stages of an explicit method, by a loop, which compiles fast."""
+
     def stage(K, xs):
         row, c, k = xs
         y = q + h * jnp.tensordot(row, K, 1)
@@ -132,6 +134,7 @@ def looped_step(
 
 
 def _unrolled_stages(method, field, t, q, h) -> list[States]:
+    """The same one after the other, which runs faster."""
     K: list[jax.Array] = []
     for row, c in zip(method.a, method.c, strict=True):
         y = q + h * _combine(row, K)
@@ -459,6 +462,8 @@ class StageEquations(NamedTuple):
 
 
 def _jacobian(field: LaneField, t, q) -> Float[Array, "n n L"]:
+    """The derivatives of the field by the states, by forward mode."""
+
     def push(direction):
         along = jnp.broadcast_to(direction[:, None], q.shape)
         return jax.jvp(lambda q: field(t, q), (q,), (along,))[1]

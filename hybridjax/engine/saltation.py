@@ -14,6 +14,11 @@ until the event, which does not depend on the state.
 coincidence). `replay.py` calls `delay_of_zero` and `chained`, for deviations of both time and
 state. In compiled programs that follow an itinerary, `itinerary/bodies.py` gets the same formula by
 forward mode.
+
+If derivatives across an event are wrong, compare `Jump.slip` with the bracket of the formula, and
+`Jump.delay_by_state` with its delay. NaN means that the rate of the guard is zero. The order of
+columns that `by_point` takes apart (value, time, states, inputs) is that of `kernels.py`, and must
+stay.
 """
 
 from typing import NamedTuple
@@ -110,7 +115,7 @@ def jump(
     q: Inexact[np.ndarray, "P n"],
     u: Inexact[np.ndarray, "nu #P"],
 ) -> Jump:
-    """Transition g at times and states before it."""
+    """Transition g at P times and states before it; the inputs may be one column for all points."""
     transition = s.transitions[g]
     a = s.chart_index(transition.source)
     b = s.chart_index(transition.target)

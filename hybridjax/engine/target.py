@@ -3,6 +3,12 @@
 Callers of `move` make a `Target` (mostly by `toward` or `until`), with one entry for each lane (a
 trajectory of many side by side). The search reads it. `AbstractLevels` is the interface of sections
 whose position depends on the state; `sections/` and `orbits/crossing.py` implement it.
+
+Levels must fall through zero at their section, as guards do at their event. The fields that are
+`static` are a part of the compiled program: another value compiles it again. A section that is
+never reached has its cause in the sign of its `level`, or in `present`; a lane that gives up too
+early has it in `limit`. A new kind of end is a field of `Target`; it is tested in
+`search/outcome.py`, and if times depend on it, replayed in `replay.py`.
 """
 
 import abc
@@ -73,7 +79,8 @@ class Target(eqx.Module):
 
 def toward(time: Float[Array, " L"], event: int, limit: Float[Array, "..."]) -> Target:
     """The target of lanes that end at times, or where `time` is infinite, at an event (or at a
-    level that is filled in later), giving up at `limit`."""
+    level that is filled in later), giving up at `limit`. (Where the time is known, the limit lies
+    just after it: a lane that is there, and has passed a scheduled event first, has not failed.)"""
     xp = namespace(time)
     shape = time.shape
     later = xp.nextafter(stop_gradient(time), xp.inf)

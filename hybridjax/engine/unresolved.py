@@ -5,6 +5,10 @@ Three callers ask: `trajectory.py` tests each step of a simulation (`passed_over
 possible at all (`may_have_pulses`, from the operations in the program of the field). A step passes
 over a pulse if the polynomial through eight values of a rate misses a part of its integral over the
 step (`_passing`). A *gain* is a derivative of the field by an input.
+
+If a good field is refused, or a pulse is passed over in silence, look at the limits in `_passing`;
+if a field is never tested, at `sudden`, which reads its program; if a jump is not found, at
+`jumps`. The columns of `values_at` must stay in their order, by which `column_name` names them.
 """
 
 import functools as ft
@@ -136,6 +140,7 @@ def _passing(
     """Test which steps in chart a, given by the rows at which they begin, pass over a pulse of each
     rate, gain and guard: the polynomial through eight of its values in the step misses the
     pulse."""
+    # What the polynomials miss, in parts that fit into memory. Columns: n rates, then gains.
     s = path.structure
     n = s.dims[a]
     m = n * (1 + s.nu)
@@ -167,6 +172,7 @@ def _passing(
         parts.append(part)
     whole = _Part(*map(np.concatenate, zip(*parts, strict=True)))
 
+    # What they may miss, relative to the magnitudes of all steps.
     accuracy = np.max(np.asarray(settings.rtol))
     if settings.scale is None:
         usual = np.abs(path.after[rows]).max(axis=0)

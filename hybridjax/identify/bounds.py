@@ -4,6 +4,10 @@ made.
 It takes the exact model and HTFs with the variances that they will have, and returns a
 `MultiplierEstimate`. With the matrices as unknowns (`fit_ldtp`), `_with_matrices` computes the
 bound; otherwise it is that of `fit_multipliers`.
+
+Nothing may be fitted here: the derivatives are those at the true model, whose HTFs are computed in
+`_exact_htf`. If a bound is wrong for both estimators, look at the `variance` of the HTFs; if for
+one only, at `residuals_of` in `variable_projection.py`, or at `_with_matrices`.
 """
 
 import dataclasses

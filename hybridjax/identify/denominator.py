@@ -6,7 +6,9 @@ Its coefficients c are real, and its roots are the d non-zero Floquet multiplier
 this denominator call this file: `multipliers_of` and `coefficients_of` convert, `sandwich` and
 `block_freedom` give the covariance of estimated coefficients and its degrees of freedom, whatever
 the distribution of the errors is. A wrong error bar has its cause in `sandwich`, or in the scores
-that it gets.
+that it gets; an infinite one, in a curvature that is not positive there. Two conventions must stay:
+arrays of coefficients are c_1 to c_d without the leading 1, and multipliers have the order of
+`multipliers_of`.
 """
 
 from typing import NamedTuple

@@ -3,7 +3,9 @@
 
 Fits with eliminated linear unknowns call `least_squares` with a function that returns residuals and
 their Jacobian. `fit_ldtp` makes its own steps from `NormalEquations`. If a fit ends too early or
-too late, look at `settled_gain`, and at the scaling of the unknowns in `least_squares`.
+too late, look at `settled_gain`, and at the scaling of the unknowns in `least_squares`; if a step
+raises the cost, at signs: `least_squares` takes the derivatives of residuals, `NormalEquations`
+those of predictions, which are the opposite. If an error bar is infinite, look at `Spread`.
 """
 
 from collections.abc import Callable

@@ -3,7 +3,9 @@
 It gets sums over all experiments from `spectral_sums.py`, one for each *line* k (the frequency k /
 P), solves each line (`_solve_lines`), and returns an `HTF` with variances. With `references`,
 `instrument.py` takes the place of both. A wrong H has its cause in `_solve_lines` or in the sums; a
-wrong variance, in `variance` within `_solve_lines`.
+wrong variance, in `variance` within `_solve_lines`; a variance that is missing, in
+`_why_not_total`; lines that are missing, in `SpectralSums.solvable`. Each H must go on to have one
+complex unknown for each input (two at mirrored lines): degrees of freedom are counted from these.
 """
 
 from typing import Literal, NamedTuple

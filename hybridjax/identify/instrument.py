@@ -144,6 +144,12 @@ class Sums(NamedTuple):
 def spectral_products(
     data: ExperimentData, repeats: int, like: Sums | None = None
 ) -> Sums:
+    """Return the products of the spectra of all signals in classes 0 to P/2, over the experiments
+    that ran well.
+
+    **Arguments:** `like`: sums of other parts of the data, whose units are taken. Default: the
+    units are magnitudes of these signals.
+    """
     N = data.n_sections
     P = data.periods
     z = np.concatenate([data.y, data.u], axis=2)[data.ok]

@@ -6,7 +6,9 @@ instrument; it is estimated by `instrument.solve` from the same sums. `Loop.miss
 them the data do not give.
 
 If an HTF is wrong, look at its signals and its reference in `estimate_loop`, and at `_without`,
-which takes out the other references; if all are wrong, at `instrument.py`.
+which takes out the other references; if all are wrong, at `instrument.py`. A further HTF is a field
+of `Loop`, and a call of `estimate` there. The sign of the controller, which is fed back with a
+minus, must stay.
 """
 
 from collections.abc import Sequence

@@ -4,6 +4,10 @@ VI-C3).
 Poles to the power N are compared with the Floquet multipliers. The fit is biased, since the true
 H_0 has more poles; `fit_multipliers` has no such bias. `_fit_one` descends from several starts
 (`_starts`), and takes the lowest minimum.
+
+If another minimum is lower, add starts (`_STARTS`); if a fit has not converged, look at
+`least_squares` in `descent.py`. The form of the function must stay as in the paper, with which it
+is compared: `_fit_one` uses the code of `fit_multipliers` as for a system with one section.
 """
 
 import functools

@@ -8,6 +8,10 @@ one section, and O[n+1].
 
 `realized` makes a model from impulse responses (for `SeriesFit.model`, bounds and designs).
 `ranges` and `shifted` are also used by `joint/realization.py`.
+
+If a model has a wrong number of states, look at `ranges` and at the level of noise (`edge`); if A
+and C are wrong, at `shifted`. The basis at a section gives the B of the section before it, so that
+`realized` shifts B by one section; this must stay.
 """
 
 from collections.abc import Sequence

@@ -4,6 +4,8 @@ Line k is the frequency f = k / P (cycles per period) of a DFT over P periods. `
 returns `SpectralSums`; experiments may come in parts, since the sums of two parts can be added
 (`_add`), so that memory does not depend on their number. Lines are selected in `_excited`, and
 spectra of outputs are computed in `_outputs`: look there if an estimate lacks lines or is shifted.
+An input that is refused because it does not repeat has its cause in `_excited`, too. A new field of
+`SpectralSums` must be a sum with the lines first (or a pair of counts), so that `_add` can add it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -272,6 +274,7 @@ def _compare_crest_factors(u: Float[np.ndarray, "S n nu"]) -> tuple[int, int]:
 
 
 def _add(a: SpectralSums, b: SpectralSums) -> SpectralSums:
+    """Return the sums over the experiments of both, at all lines of either."""
     line = np.union1d(a.line, b.line)
     rows_a = np.searchsorted(line, a.line)
     rows_b = np.searchsorted(line, b.line)

@@ -9,7 +9,8 @@ that d multipliers are left (variable projection: Golub and Pereyra 1973).
 
 `remove_transient` returns the data without the transient. `_decays` finds the multipliers and the
 transients, from rows of the data in which the sinusoids cancel (`_free`): a wrong decay has its
-cause there.
+cause there, and so has a record of which too few rows are left; an input that is refused has it in
+`_require_repetition`. The first period must be cut off, since zero multipliers act in it.
 """
 
 import dataclasses

@@ -3,7 +3,9 @@ residuals.
 
 The model is simulated from the initial states that fit best (`predicted` of the fits), and a
 `Validation` is returned. The tests themselves are in `series/residuals.py`. If a good model is
-rejected, look first at `whitened` there, which takes the errors of the fit into account.
+rejected, look first at `whitened` there, which takes the errors of the fit into account; if records
+are left out, at `can_be_compared`; if cycles are said to be too few, at `_lags`. Independence
+must be tested on samples all of whose lagged inputs are known (`late` in `validate`).
 """
 
 import itertools
@@ -283,6 +285,7 @@ def validate(
 
     **Before:** `hj.fit_series`, `hj.fit_ldtp` or `hj.linearize`. **After:** `validation.plot()`.
     """
+    # The model, and the records that can be compared with it.
     free_start = start == "free"
     records = uninterrupted_records(data)
     findings = _about_harmonics(model)
@@ -313,6 +316,7 @@ def validate(
         of_section = np.diag(prepared.scale**2)
         S = np.tile(of_section, (N, 1, 1))
         tested = Predictor(PeriodicModel.of(tested, np.ones(ny)), S)
+    # Simulated outputs and residuals.
     y = np.where(grid.sampled, grid.y, np.nan)
     with np.errstate(all="ignore"):
         simulated = tested.predicted(grid, free_start)
@@ -331,6 +335,7 @@ def validate(
     square_of_outputs = np.mean(simulated[grid.inside] ** 2, axis=0)
     size = np.sqrt(square_of_outputs)
 
+    # The two tests.
     autocorrelation, whiteness = whiteness_test(whitened(error, roots), lags)
     # (From these samples on, all lagged inputs are known.)
     is_late = (grid.age >= lags)[..., None]
@@ -341,6 +346,7 @@ def validate(
         inputs, late, lags, alpha / ny, roots
     )
     rounding = is_exact(grid, error)  # (shows nothing)
+    # The longest record is shown.
     k, longest = max(enumerate(compared), key=lambda pair: len(pair[1].u))
     first = longest.first_section
     # Inputs after the last samples are unknown.

@@ -11,7 +11,10 @@ depends on c alone (variable projection: Golub and Pereyra 1973).
 entry of the HTFs, or a combination of two entries with real numerator. Residuals and their
 derivatives are those of `misfit_of`: test these first.
 
-Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$.
+Errors are scaled to variance 1 of each real component: $w = \sqrt{2 / E|\varepsilon|^2}$. Real
+equations are all real parts, then all imaginary parts (`split`). Both must stay. If error bars are
+wrong, look at `summarize`; if numerators are, at `unfold`; if HTFs are refused for too few
+frequencies, at `numerator_size`.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,9 @@
 """The errors of harmonic transfer functions, known or supposed, as weights of fits.
 
 `check_values` comes first in every fit to HTFs, and `error_weights` gives the weights; fits in
-`identify` and `fitting` and the designs use both. A wrong weight comes from `_separated`.
+`identify` and `fitting` and the designs use both. A wrong weight comes from `_separated`; an HTF
+that is refused, from `check_values`. Real and imaginary part have half of the variance each
+(`weights_of`); this must stay, since degrees of freedom are counted in real numbers.
 Experiments that measure the same lines are weighted by their power, in `spectral_sums.py`.
 """
 

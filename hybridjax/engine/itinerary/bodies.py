@@ -20,6 +20,11 @@ All rows that do the same share one piece of the program. Only the functions of 
 guards, resets) are chosen among, by the number of the chart or of the kind of transition.
 Functions of one lane end with the arguments of a stage (`motion.py`): the structure, constants,
 what moves, and notes.
+
+The order in the table must stay: each function reads what the one before has put into the course.
+If the time of an event is wrong, look at `_aimed`; if the state after it is, at `_shifted` and
+`_reset`; if states are right and derivatives are not, compare the columns in these three with the
+formula. A trajectory that leaves its itinerary without need has its cause in `flags.py`.
 """
 
 import dataclasses

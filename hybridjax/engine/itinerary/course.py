@@ -2,7 +2,12 @@
 (`Constants`).
 
 Charts may have different numbers of states: a `Course` has d numbers, the largest of them. Those
-that a chart does not use are zero.
+that a chart does not use are zero; each stage that sets a state keeps them so (`padded_like`).
+
+A new field of `Course` also gets its value at the start, in `_departed` of `turn.py`. All numbers
+of a `Course` have derivatives; numbers without derivatives belong in `Flags`. Nothing is computed
+here: a wrong number was set by a stage in `bodies.py`, and a wrong end of a leg by `_arrived` or
+`_schedule` there.
 """
 
 from collections.abc import Callable

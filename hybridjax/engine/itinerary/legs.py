@@ -3,7 +3,11 @@
 A search leaves a tape of its moves (steps and jumps). A *leg* is the part between two events, in
 one chart. It ends with an event, on the level of a section, or at a time. `legs_of` reads legs from
 a tape. `Leg.nodes` chooses where the steps of an itinerary begin, and `Leg.signs` says which sign
-each watched function has there.
+each watched function has there. `recorded.py` calls these three, and writes rows from them.
+
+A sign of 0 must go on to mean that nothing is known: `flags.py` does not test such a function. If
+trajectories leave their itinerary without need, look at `known_signs`, which may call a rounding
+error a sign; if a leg begins or ends in the wrong place, at `ends_leg` in `legs_of`.
 """
 
 from typing import NamedTuple

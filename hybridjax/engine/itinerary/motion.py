@@ -12,6 +12,10 @@ numbers that have none, such as its `Flags`. Code that chains stages takes a `Mo
 
 The derivative of a choice among stages is the choice among derivatives (`choose`): JAX would take
 many times as long to differentiate the choice itself.
+
+`turn.py` makes the `Motion`, and `bodies.py` uses it. Both classes must keep the same methods, so
+that code with a `Motion` has no cases. If values are right and a derivative is zero that should not
+be, look for a number with derivatives among the `notes`, or for a `still` around it.
 """
 
 from collections.abc import Callable, Sequence

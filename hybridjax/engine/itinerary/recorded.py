@@ -8,7 +8,9 @@ Both cut the tape into legs, choose the steps of each leg, and have `_Writer` wr
     STEP, for each correction of the time of its end
     JUMP, LEVEL or TIME, for its end
 
-If rows are missing or in a wrong order, look in `_Writer`; `rows.py` says what columns mean.
+This order must stay: a row needs what the rows before it have computed. If rows are missing or in a
+wrong order, look in `_Writer`; if a leg itself is wrong, in `legs.py`; if an itinerary is not used
+although it could be, in `_is_certain`. `rows.py` says what columns mean.
 """
 
 from typing import Any, NamedTuple
@@ -43,7 +45,7 @@ CORRECTIONS = 2
 # Rows of a table are a multiple of this. More: empty rows take time. Fewer: itineraries of other
 # lengths compile again.
 _ROUND = 128
-# The same of legs.
+# The number of ends of legs in an itinerary is a multiple of this, for the same reason.
 _LEGS = 4
 
 _TYPES = {

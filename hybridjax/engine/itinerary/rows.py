@@ -19,6 +19,10 @@ The end of a leg is not known exactly, so that each step takes a fraction of its
 follow: steps of the length that brings a watched function to zero, which is Newton's method for the
 time of the event. JUMP and LEVEL begin with a last correction, by Euler's method. SCHEDULE comes
 before the steps of a leg that ends by the clock, and TIME ends a leg at a time that is known.
+
+Nothing is computed here: wrong rows come from `recorded.py`. A new column of `Rows` also needs a
+type in `_TYPES` and a value in `_Writer._add` there, and a field of `Row` in `table.py`. A row that
+does something new needs a number below, a `Body` from `_Writer`, and stages in `bodies.py`.
 """
 
 from typing import NamedTuple

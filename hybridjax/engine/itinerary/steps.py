@@ -10,7 +10,9 @@ A step moves an array y (1 + C, n), whose rows are
 `unit_step` takes explicit steps, with a solver of diffrax; `rates` has the right sides above.
 `implicit_step` solves for the stages of an implicit method, by iterations that carry derivatives.
 If states are right and derivatives are wrong, look in `rates`, or in the two last Newton steps of
-`implicit_step`.
+`implicit_step`. If states themselves are wrong, compare with `take_step` in `runge_kutta.py`, which
+has the same coefficients. `bodies.py` calls these functions. The state must stay in row 0, and the
+Newton steps of an implicit step must stay two: the second one gives the derivatives.
 """
 
 import functools as ft

@@ -3,6 +3,10 @@
 `tabulated` replaces the number of a row's body by the numbers that the program chooses by (chart,
 kind of jump, and so on). A `Table` has all of them in two arrays, because the program reads a line
 of an array at once: a line of `numbers` is the first fields of `Row`, in order, then the signs.
+
+A new number of a row is a field of `Row`, and a column at the same place in `tabulated` (and a name
+in the list of `read`, if it is true or false). The fields `fraction` and `signs` must stay last. If
+rows are recorded rightly and the program does something else, look at `tabulated`.
 """
 
 from typing import NamedTuple

@@ -10,8 +10,12 @@
 | `Flags` | whether the itinerary was kept: reported as `left` |
 
 `_Steps` has the loop: `loop` over a count of rows, or `scan`, which reverse mode can differentiate,
-over all of them. A wrong state comes from `bodies.py` or `steps.py`; a trajectory that leaves
-without need, from `flags.py`.
+over all of them. (A step of this loop is a row; steps of integration are in `steps.py`.) The order
+in `_Steps.row` must stay: the end of a piece is written before the row acts (`_Begun.ended`),
+because the row makes its columns begin anew. `_Steps.take_along` does the same with derivatives.
+
+A wrong state comes from `bodies.py` or `steps.py`; a trajectory that leaves without need, from
+`flags.py`; wrong factors of pieces with right states, from `_Begun` or `_passage`.
 """
 
 import dataclasses

@@ -6,6 +6,11 @@ the same way. Charts with fewer functions are filled up by functions that are in
 program serves all charts.
 
 A value of infinity also stands for a function of which nothing is known, because a leg begins.
+
+`bodies.py` evaluates these functions where a row begins, and `flags.py` compares them with the
+recorded signs. The numbering must stay, since recorded rows refer to it. If another function is
+compared than the recorded one, look at `watched_values`; if an event counts though its predicate
+does not hold, at `with_predicates`.
 """
 
 from typing import NamedTuple

@@ -5,6 +5,9 @@ reads this attempt, and returns a `Verdict`, from which `outcome.py` makes the n
 *watched function* is a guard or the level of the target section. An *approach* leads to a crossing
 that was met within a step: the lane aims at it, until a step *lands* on the zero. An event that is
 missed has its cause in `_crossing`, an approach without end in the first part of `accept`.
+
+Each active lane must have exactly one of the verdicts `plain`, `lands`, `too_long`, `refine`,
+`crosses`, `closer` and `lost`: `outcome.py` relies on this. (`touch` comes in addition.)
 """
 
 from typing import NamedTuple

@@ -6,7 +6,9 @@ target section) are known along the step. If a lane aims at a crossing and its s
 it, `land` moves the end of the step onto the zero. The cubic Hermite interpolant of each watched
 function stands for this function along the step, and `margin` is the estimated error of the
 interpolant. If steps are too long or too short, look at `_errors`; if events are missed, look at
-`_margin` and `_clearance`.
+`_margin` and `_clearance`; if a good crossing is called grazing, look at `SLOW`, and at
+`_is_shallow` in `outcome.py`. The two corrections of a landing (`ChartFlow.locate`) must stay those
+of a replay, which differentiates them.
 """
 
 from typing import NamedTuple
@@ -146,6 +148,7 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
     )
 
     def work(a, here, out):
+        # A step of chart a, and its error.
         flow = chart_flow(s, a, here, task.u, task.target)
         n = s.dims[a]
         rows = flow.rows
@@ -161,6 +164,7 @@ def attempt(state: State, aim: Aim, task: Task) -> Attempt:
             out = out._replace(along=along)
         end = Landing(step.q, step.f1, zero, no, zero, step.middle, step.rate)
         if rows:
+            # Lanes that aim at a zero land on it. Then, what is known of the watched functions.
             before = Watch(*(take_rows(x, rows) for x in state.watched))
             which = xp.where(here, aim.which, -1)
             goal = aim._replace(which=which, step=tau)

@@ -5,6 +5,11 @@ to be attempted, and `Attempt` the step that was computed. `Options`, `Stride`, 
 `Recorded` are what callers of `move` give and get. Each array has lanes (trajectories side by side)
 on its last axis. A *watched function* is a guard, or the level function of the target section; its
 zeros end steps.
+
+A new field gets its value where its tuple is made, and a wrong value comes from there: `State` from
+`_begin` in `search.py` and from both functions of `outcome.py`, `Aim` from `take_aim` in
+`search.py`, `Attempt` from `attempt.py`. Shapes and types must stay the same during a search, since
+JAX compiles its loop.
 """
 
 from typing import NamedTuple

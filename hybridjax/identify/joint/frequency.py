@@ -15,7 +15,9 @@ with $\nu_m[n] = z_m^{-1} \mu_m[n+1]$, $z_m = z e^{2 \pi i m / N}$ and the adjoi
 + z_m^{-1} \mu_m[n+1] A[n]$.
 
 `fit_ldtp` calls `FrequencyProblem` for costs and linearized equations; designs and bounds call
-`transfer` and `transfer_slopes`. If a derivative is wrong, compare `_fill` with the second formula.
+`transfer` and `transfer_slopes`. If a derivative is wrong, compare `_fill` with the second formula;
+if the HTFs themselves are wrong, look at `states_at`. The order of the axes of an HTF (harmonic,
+frequency, output, input) must stay, also in its derivatives, which have the unknown first.
 """
 
 from collections.abc import Iterator
@@ -80,6 +82,7 @@ class FrequencyProblem(NamedTuple):
             return np.inf
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
+        """Return the least-squares problem of the P coordinates around their model."""
         P = coordinates.size
         error = self.errors(coordinates.model)
         gram = np.zeros((P, P))

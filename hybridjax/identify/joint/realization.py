@@ -7,7 +7,8 @@ section; Uyanik et al. 2019 treat periodic systems by lifting). Given A and C, B
 least-squares problem.
 
 `fit_ldtp` calls `realized_htf` for its first model. If this has the wrong dimensions, look at the
-level of noise there.
+level of noise there (`edge`); if A and C are wrong, at `_without_later_inputs`; if only B and D
+are, at `PeriodicModel.refined`. The weight of a column must be the same in all of its rows.
 """
 
 from collections.abc import Sequence

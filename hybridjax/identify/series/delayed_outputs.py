@@ -6,6 +6,10 @@ successive cycles, weighted by its coefficients, is zero up to noise. `late_outp
 products of outputs 0, 1, ..., d cycles earlier over all sections and records. `total_least_squares`
 has no bias by white noise: `fit_series` and the choice of an order start from its result.
 `ordinary_least_squares` is biased to zero; it serves only as a comparison.
+
+The output that is not delayed must stay the first one of the Gram matrix: both solutions count on
+it. If a start is far off, look at the rows that `late_outputs` uses (`used`); if it is zero, the
+leading coefficient was too small (`total_least_squares`).
 """
 
 from typing import NamedTuple

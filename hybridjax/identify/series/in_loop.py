@@ -13,6 +13,11 @@ correlated with $\varepsilon$.
 
 `fit_series` makes `LoopEquations` if references are given, and calls `fit`. B is eliminated section
 by section (`_section`), and the rest is linear in c (`solution`).
+
+The instruments must be simulated from the references alone (`predicted`, with a model without K):
+measured outputs in them would bias the fit. If multipliers are refused as not determined, look at
+`solution`; if numerators lack a part, at `kept` in `_section`; if error bars are wrong, at
+`_scores`.
 """
 
 import dataclasses
@@ -145,6 +150,11 @@ class LoopEquations:
     def _section(
         self, n: int, z: Float[np.ndarray, "S T N nuy"], free: int
     ) -> SectionEquations:
+        """Return the equations of section n.
+
+        **Arguments:** `z`: inputs and outputs that the references predict. `free`: cycles at the
+        start of each record that are left out.
+        """
         grid = self.grid
         delays = range(self.order + 1)
         _, T, _, nu = grid.u.shape
@@ -155,6 +165,8 @@ class LoopEquations:
         first = grid.first[:, n, None] + free
         begun = np.arange(T) >= first
         used = np.all(sampled, axis=0) & begun
+        # Lagged inputs, predicted and measured, then outputs 0 to d cycles earlier, predicted and
+        # measured; the drift is projected out of all.
         inputs_of_section = (z[..., :nu], grid.u)
         signals = [lagged_inputs(u, n, self.lags, lead) for u in inputs_of_section]
         for y in (z[..., nu:], grid.y):
@@ -174,6 +186,7 @@ class LoopEquations:
         by_rounding = RANK * size.max(initial=0)
         kept = size > np.maximum(by_noise, by_rounding)
         to_lags = V[kept].T / size[kept]
+        # B is eliminated: outputs without what inputs explain, by the instruments.
         instruments = Z @ to_lags
         inputs = U @ to_lags
         inverse = np.linalg.inv(instruments.T @ inputs)

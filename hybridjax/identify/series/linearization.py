@@ -4,7 +4,9 @@ records, and the minimum over c.
 `fit_series` calls `minimize`, which calls `linearize` at each c. `linearize` fits the numerators of
 every section (`SectionFit`), and adds up residuals and their derivatives by c (`Linearization`). A
 *grid* is a group of records of similar length (`records.py`). A wrong gradient comes from
-`SectionFit.of`.
+`SectionFit.of`, wrong regressors from `_regressions_at`; a descent that ends too early, from
+`least_squares` in `descent.py`. All sums here are in units of `OutputErrorProblem.scale`, and must
+stay so: `series/fit.py` converts them.
 """
 
 import functools
@@ -200,6 +202,7 @@ def linearize(
 
 
 def _regressions_at(problem: OutputErrorProblem, c: Coefficients) -> Regress:
+    """Return a function for the regressions of a section at c, on inputs divided by chi."""
     inputs = [divide_by_chi(c, part.u) for part in problem.parts()]
 
     def regress(k: int, part: CycleGrid, n: int) -> list[SectionRegression]:

@@ -10,7 +10,9 @@ regression.
 
 `OutputErrorProblem` has the data of a fit that do not depend on c, and `SectionRegression` the
 regression of one section at some c. `linearization.py` and `delayed_outputs.py` call them. If
-unknowns are missing or too many, look at `SectionRegression.make`.
+unknowns are missing or too many, look at `SectionRegression.make`; if data are refused for too few
+cycles, at `freedom_left`; if inputs are said to depend on each other, at `_independent`. What
+depends on c must stay out of `OutputErrorProblem`, which is made once for a fit.
 """
 
 from typing import Any, NamedTuple
@@ -76,6 +78,7 @@ class SectionRegression(NamedTuple):
         drift: Float[np.ndarray, "S T k"],
         weight: Shaped[np.ndarray, "S T"],
     ) -> "SectionRegression":
+        """Return the regression of outputs that are sampled where `weight` is not zero."""
         rows = weight[:, :, None].astype(float)
         unknown = rows * np.concatenate([starts, drift], axis=2)
         basis, size, right = np.linalg.svd(unknown, full_matrices=False)
@@ -240,6 +243,8 @@ def _require_different_inputs(
 
 
 def _independent(triangle: np.ndarray, nu: int) -> np.ndarray:
+    """Return the combinations (lags nu, r) of lagged inputs that are linearly independent, from the
+    triangular factor of the lagged inputs."""
     # Inputs have units of their own.
     size = np.linalg.norm(triangle.reshape(-1, nu), axis=0)
     lags = triangle.shape[1] // nu

@@ -10,7 +10,9 @@ of the same sample.
 
 `fit_ldtp` calls `SeriesProblem` (cost, linearized equations, weights), and `hj.validate` calls
 `Predictor`. `SeriesProblem.path` computes states and errors, and `slopes_of` the derivatives of
-predictions: compare these two if a fit does not converge.
+predictions: compare these two if a fit does not converge. Derivatives must stay those of
+predictions, not of errors (see `NormalEquations`). If gaps in the records spoil a fit, look at
+`SeriesProblem._weights`; if a spectrum of noise is wrong, at `noise_spectrum`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -148,6 +150,8 @@ class SeriesProblem(NamedTuple):
         return self._replace(S=vectors * variances @ vectors.mT)
 
     def linearize(self, coordinates: LocalCoordinates) -> NormalEquations:
+        """Return the least-squares problem of the P coordinates around their model, with the
+        initial states eliminated."""
         P = coordinates.size
         gram = np.zeros((P, P))
         gradient = np.zeros(P)
@@ -494,6 +498,6 @@ class Predictor(NamedTuple):
     def errors(
         self, grid: CycleGrid, free_start: bool
     ) -> Float[np.ndarray, "R T N ny"]:
-        """Return the errors of `predict`; NaN where an output was not sampled."""
+        """Return the errors of `predicted`; NaN where an output was not sampled."""
         left = grid.y - self.predicted(grid, free_start)
         return np.where(grid.sampled, left, np.nan)

@@ -5,6 +5,11 @@ model that predicts the instruments of a loop (`in_loop.py`). If it is inaccurat
 more iterations, and the fit in the loop loses efficiency. `answers_at_once` tests whether outputs
 respond to inputs at the same section, so that `fit_ldtp` needs D. `without_drift` removes the drift
 of signals. The first two regress the signals at a section on their past (`_sections`, `_regress`).
+
+If a first model is far off, look at the length of the past (`past` in `subspace_model`), and at
+`_from_states`, which shrinks models that are unstable. If D is fitted without need, or is missing,
+look at `answers_at_once`. The newest sample must stay the first one in `_Section.past`, since
+`subspace_model` shifts the past by whole samples.
 """
 
 from collections.abc import Sequence
@@ -237,6 +242,11 @@ def _from_states(
     innovations: bool,
     direct: bool,
 ) -> PeriodicModel:
+    """Return the model whose state at a section is its past times `to_state`, made stable.
+
+    C and D come from a regression of the outputs, A, B and K from one of the state at the next
+    section.
+    """
     N = len(sections)
     nu = sections[0].u.shape[1]
     blocks: list[tuple] = []
