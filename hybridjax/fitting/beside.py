@@ -4,8 +4,12 @@ search.
 `fit.py` makes a `Model` and calls it at each point of the parameters. The cycle at this point
 follows the *route* of a known cycle, that is, its recorded sequence of steps and events
 (`orbits/near.py`); its sections follow the *walk* of the known sections (`sections/walk.py`). If
-the cycle leaves all known routes, a search finds it, and it becomes one more known cycle. If
-residuals differ from those of a search, look at `_model`.
+the cycle leaves all known routes, a search finds it, and it becomes one more known cycle.
+
+If residuals differ from those of a search, look at `_model`; if a Jacobian does, look at
+`first_order_cycle`, which has first derivatives in forward mode alone, and at `walk_with`. If a fit
+stays slow, `_can_repeat` and `_beside` say why it has no program: a further type of data whose
+residuals need a search is named in `_can_repeat`. Walks must stay in the order of `_families`.
 """
 
 import collections
@@ -185,6 +189,8 @@ def _beside(problem: FitProblem, known: LimitCycle) -> Beside | None:
 
 
 def _families(observations: Any) -> list[AbstractSections]:
+    """The families of sections in the observations, in the order of the leaves of their tree."""
+
     def is_family(x):
         return isinstance(x, AbstractSections)
 
@@ -208,6 +214,9 @@ def _run(
 def _evaluated(
     problem: FitProblem, system: HybridSystem, beside: Beside, x: Array, q: Array
 ) -> Evaluated:
+    """The program that `_run` calls (`Model._evaluated` chooses the known cycle). Residuals are
+    infinite if no cycle was found on the route."""
+
     def at(x):
         cycle, observations = _model(problem, system, beside, x, q)
         parts = [observation.residuals(cycle) for observation in observations]

@@ -8,7 +8,10 @@ evaluated in `beside.py` or `problem.py`. `identifiability` evaluates the Jacobi
 fit.
 
 If a fit ends at a wrong minimum, look at `_starts_around` and `_descend`; if residuals are wrong,
-at `observations.py` or `transients.py`; if standard errors are, at `_of_end`.
+at `observations.py` or `transients.py`; if standard errors are, at `_of_end`; if data or bounds are
+refused, at `_prepare` and `_transients`; if a guess has no cycle, at `_cycle_at`. Two things must
+stay: the first guess is `system` itself, and the cycle of the result comes from
+`find_limit_cycle` (`_summary`), since cycles of the iteration have fewer checks.
 """
 
 from collections.abc import Sequence
@@ -305,6 +308,7 @@ def _transients(
 
 
 def _require_same_weighting(observations: Sequence[AbstractObservation]) -> None:
+    """**Raises:** `DefinitionError` if only some of the data have standard deviations."""
     if len({bool(observation.weighted) for observation in observations}) > 1:
         raise DefinitionError("give standard deviations of all data, or of none.")
 
@@ -340,6 +344,7 @@ def _relative(
 
 
 def _sizes(values: Array) -> Array:
+    """The magnitudes of values, to which their changes are relative; 1 for zero."""
     return jnp.where(values == 0, 1.0, jnp.abs(values))
 
 
@@ -389,6 +394,8 @@ def _descend(
     cycle: LimitCycle,
     model: Model,
 ) -> End:
+    """The end of the iteration from one guess. `cycle`: the cycle there; if it was not found, the
+    guess is also the end, and its cost is infinite."""
     if int(cycle.result) != Result.OK:
         none = np.zeros(0), np.zeros((0, len(start)))
         return End(start, start, np.inf, *none, cycle, 0, int(cycle.result))
@@ -405,6 +412,8 @@ def _summary(
     best: End,
     near: LimitCycle | None,
 ) -> ModelFit:
+    """The fit with the best of all ends, and its cycle: from a search that begins at `near`, or if
+    that leads elsewhere, at the last cycle of the iteration."""
     assert best.cycle is not None and near is not None
     cycle = _cycle_at(problem, system, best.x, near)
     # (A search from a distant cycle may find another one.)

@@ -7,7 +7,9 @@ sensitivities, and `_readable` and `_rounded` bring them to a form with small in
 
 If a combination is identified by rounding alone, or one that the data determine is not, look at
 `_RANK`; if a combination is printed badly, at `_CLOSE` and `_describe`. Wrong standard errors come
-from the covariance, which `fit.py` computes.
+from the covariance, which `fit.py` computes. A further finding is added in `ModelFit._doubts`. Two
+things must stay: `values`, `covariance` and `unseen` have the order of `names`, and the fields of
+`ParameterEstimate` are what `hj.save` writes.
 """
 
 import itertools

@@ -1,9 +1,14 @@
 """Data to which systems are fitted. Each type converts a limit cycle to weighted residuals.
 
 `fit_model` calls `prepare` once, outside of JAX, for checks; then `residuals(cycle)` at each point
-of the parameters, inside of a program. A further type of data is a subclass of
-`AbstractObservation`. A fit that is biased for one type of data has its cause in the `residuals` of
-this type.
+of the parameters, under JAX transformations. A further type of data is a subclass of
+`AbstractObservation`; if its residuals need a search for events, it is also named in `_can_repeat`
+(`beside.py`). Residuals must stay prediction minus measurement, always equally many, and
+differentiable in forward mode.
+
+A fit that is biased for one type of data has its cause in the `residuals` of this type. If data
+weigh too much, look at `_scale`, and for HTFs at `error_weights`; if times are wrong by whole
+periods, at `_without_turns`; if data are refused, at `__init__` and `prepare` of their type.
 """
 
 import abc

@@ -2,9 +2,15 @@
 minimization (`descend`).
 
 `fit.py` calls `free_parameters` and `descend`. Parameters are changed in coordinates x without
-bounds (`Parameters.encode`, `decode`). `evaluate` returns residuals and their Jacobian at x;
-`TransientProblem` does the same for trajectories, without a limit cycle. An iteration that ends too
-early has its cause in `descend`.
+bounds (`Parameters.encode` and `decode`, which must stay inverse to each other). `evaluate` returns
+residuals and their Jacobian at x; `TransientProblem` does the same for trajectories, without a
+limit cycle. Residuals must be infinite where there is no cycle (`_joined`): `descend` then takes a
+shorter step. A further kind of free parameter, as delays are one, needs a case in `_value`,
+`of_system` and `Parameters.observed`.
+
+An iteration that ends too early has its cause in `descend`. If a Jacobian is wrong, look at
+`candidate_cycle`, and compare the two ways of `evaluate`; if a name or a bound is refused without
+need, look at `free_parameters`.
 """
 
 import dataclasses
@@ -148,6 +154,11 @@ def of_system(name: str) -> bool:
 
 
 def _value(system: HybridSystem, observations: Observations, name: str) -> Array:
+    """The value of a free parameter: of the system, a delay of observations, or a state at the
+    start of a trajectory.
+
+    **Raises:** `DefinitionError` for a delay that no observation has.
+    """
     if AT_START in name:
         state, _, number = name.partition(AT_START)
         trajectory = observations[int(number) - 1]
@@ -350,6 +361,8 @@ def _transient(problem: TransientProblem, x: Float[Array, " p"]) -> tuple[Array,
 
 @jax.jit
 def _joined(parts, result):
+    """Residuals of all observations, one after the other; infinite if one of them is not finite, or
+    if there is no cycle."""
     r = jnp.concatenate(parts)
     is_finite = jnp.isfinite(r).all()
     return jnp.where((result == Result.OK) & is_finite, r, jnp.inf)
@@ -446,5 +459,6 @@ def descend(
 
 
 def _small(change: Float[np.ndarray, " n"], x: Float[np.ndarray, " n"]) -> bool:
+    """Test whether each entry of x has changed by less than the tolerance."""
     allowed = _TOLERANCE * (1 + np.abs(x))
     return bool(np.all(np.abs(change) < allowed))

@@ -2,9 +2,10 @@
 optimization.
 
 The largest modulus itself has no derivative where multipliers coincide. `_smooth_radius` solves for
-the bound by Newton's method. The equation in the docstring of `spectral_radius` is the contract; if
-the bound is wrong, compare it with `excess`. No error is raised: matrices that are not finite give
-NaN, and so may a `smoothing` below 1e-14, which rounding hides.
+the bound by Newton's method, which must begin below it: from there it never passes the bound. The
+equation in the docstring of `spectral_radius` is the contract; if the bound is wrong, compare it
+with `excess`. No error is raised: matrices that are not finite give NaN, and so may a `smoothing`
+below 1e-14, which rounding hides.
 """
 
 import jax

@@ -5,9 +5,9 @@ transients.
 with outputs at the measured times and times of events, minus the measurements. States at the start
 may be unknown (`start_value`, `with_start`).
 
-Residuals are NaN where the flow lacks a measurement: `lack_of` says why. If a residual is wrong,
-look at `residuals_of` (which event is compared with which) and `_outputs`; if it has a wrong
-weight, at `_sizes` and `_event_size`.
+Residuals are NaN where the flow lacks a measurement, and must not be left out there, since their
+number is fixed: `lack_of` says why. If a residual is wrong, look at `residuals_of` (which event is
+compared with which) and `_outputs`; if it has a wrong weight, at `_sizes` and `_event_size`.
 """
 
 from collections.abc import Callable, Mapping

@@ -3,8 +3,12 @@
 `LimitCycle.asymptotic_phase` calls `asymptotic_phase`. The state is simulated from crossing to
 crossing of the cycle's section, until it is so close to the cycle that the phase response
 (`responses.py`) is accurate. The time that has passed, minus whole periods, then gives the phase.
-If a state does not reach the cycle, look at the search (`engine/move.py`); if a phase is
-inaccurate, at `near`, the distance below which it counts as linear.
+The deviation must be that from the anchor, which has the phase 0.
+
+If a state does not reach the cycle, look at the reason in the error, then at the search
+(`engine/move.py`); each crossing is awaited for three periods. If a phase is inaccurate, look at
+`near`, the distance below which it counts as linear. (Larger: phases are less accurate. Smaller:
+more crossings are needed.)
 """
 
 from typing import Any

@@ -4,9 +4,13 @@
 `Rounds`: the last Newton step of each system, with its result code. Each system begins from a guess
 of its own, mostly the cycle of its nearest neighbor in the parameters. A *turn* is one application
 of the return map: the flow from the section back to it. A *tile* is a number of systems that are
-computed by one call; in it, each system is a *lane*, an entry on the last axis of every array. If a
-system fails here whose cycle `find_limit_cycle` finds, look at `_step` (Newton) and `_again`
-(further attempts).
+computed by one call; in it, each system is a *lane*, an entry on the last axis of every array. The
+results of a call have the systems on the first axis (`_apart`), and `Tiles.solve` returns them in
+the order of `systems`: both must stay.
+
+If a system fails here whose cycle `find_limit_cycle` finds, look at `_step` (Newton) and `_again`
+(further attempts); if it gets a cycle of another branch, at `_nearest`, which chooses its guess; if
+a good turn is refused, at `_verdict`.
 """
 
 import dataclasses
@@ -135,7 +139,8 @@ class Tiles(NamedTuple):
         these few.
 
         Systems that fail begin again from the cycle of the nearest system: first from the end of a
-        simulation that begins on it, then from the cycle itself.
+        simulation that begins on it, then from the cycle itself, then from the end of a longer
+        simulation (`_SETTLE`).
         """
         numbers = numbers_of(self.systems)
         order = np.random.default_rng(0).permutation(S)
@@ -178,6 +183,7 @@ class Tiles(NamedTuple):
         return _pick(out, np.argsort(order))
 
     def _given(self, rows) -> tuple[Lanes, Float[np.ndarray, " S"]]:
+        """The anchor and the period of the guess, once for each row."""
         given = self.map.anchor, self.map.expected
         return jax.tree_util.tree_map(
             lambda x: np.repeat(np.asarray(x)[None], len(rows), 0), given
@@ -298,6 +304,7 @@ class Tiles(NamedTuple):
         def run(k):
             left = len(rows) - k
             size = min(self.size, -(-left // WIDE) * WIDE)
+            # (A tile that is not full gets the first systems again; their results are cut off.)
             tile = np.arange(k, k + size) % len(rows)
             begin, expected, *further = _pick((anchor, period, *others), tile)
             if self.periods is not None:

@@ -1,10 +1,14 @@
 """The reason for which a branch of limit cycles ends, read from its last cycle.
 
 `branches.py` calls `explained` with the last cycle of a branch and the result of the turn that
-failed beyond it, and gets an `End`: a sentence, and the place. `explained` tries the causes one
-after the other, and the first one that holds is the reason. A *visit* is the stay of the cycle in
-one chart between two events. If a branch reports the wrong reason, look at the order in
-`explained`.
+failed beyond it, and gets an `End`: a `Result`, and a sentence. `explained` tries the causes one
+after the other, and the first one that holds is the reason: a further cause is added there. Its
+order must stay, since a cycle that has shrunk also seems to touch its section, and
+`_missed_section` holds for every crossing that is missed. A *visit* is the stay of the cycle in one
+chart between two events.
+
+If a branch reports the wrong reason, look at the order in `explained`, and at the limit of the
+function that gave it (`_SLOW`, `_CLOSE`, `_SMALL` or `_REST`); if it reports none, at `_UNCLEAR`.
 """
 
 from typing import NamedTuple
@@ -51,6 +55,8 @@ _UNCLEAR = (
 
 
 class End(NamedTuple):
+    """The reason for an end. (Its fields are the last ones of a `BranchEnd`, in the same order.)"""
+
     result: Result
     message: str
 

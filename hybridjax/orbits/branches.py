@@ -3,8 +3,12 @@
 `continuation` is the public function: it follows a branch of cycles in both directions
 (`_Trace.run`), marks bifurcations between points (`_Trace.locate`), and returns a `Branch`. Points
 themselves are computed in `curve.py`, and the reason for an end is found in `branch_ends.py`. A
-branch that jumps to another one has its cause in the length of steps (`_Trace._next`); a
-bifurcation that is missed, in `_Trace.between`.
+further kind of bifurcation is added to `Kind`, to `Point.tests` and to `_Trace.locate`. Points must
+stay in their order along the branch: `_branch` cuts it at the first cycle that is refused.
+
+A branch that jumps to another one has its cause in the length of steps (`_Trace._next`); one that
+ends too early, in `Curve._correct` or in the verdicts (`_branch`); a bifurcation that is missed, in
+`_Trace.between`; one of the wrong kind, in `_Trace.locate`.
 
 H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, 1977; Yu. A.
 Kuznetsov, Elements of applied bifurcation theory, 3rd ed., Springer 2004, Ch. 10 (test functions).
@@ -386,6 +390,11 @@ def _explained(cycle: LimitCycle, end: BranchEnd) -> BranchEnd:
 
 
 def _check(cycle, values) -> np.ndarray:
+    """Return the range as an array.
+
+    **Raises:** `DefinitionError` for a cycle that has changed or was not found, and for values
+    without order.
+    """
     require_x64(cycle)
     cycle.require_current()
     if int(cycle.result) != Result.OK:
@@ -430,9 +439,12 @@ class _Trace(NamedTuple):
                 longer = 1.5 * length if point.steps <= USUAL_STEPS else length
                 length = min(self.step, longer)
                 continue
+            # There is no point at this length: half of it is tried.
             length = length / 2
             if length >= _SHORTEST * self.step:
                 continue
+            # An event may have come to the phase of the clock at which the cycles begin: once, the
+            # last cycle is anchored at another phase.
             at_other_phase = None
             if point in (Result.EVENT_ORDER, Result.GRAZING) and last is not moved:
                 at_other_phase = self.curve.elsewhere(last)

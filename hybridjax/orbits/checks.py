@@ -1,11 +1,18 @@
 """Checks of what users state about a system (clock, symmetry, conserved quantities, outputs), and
 the texts that explain why a search for a limit cycle failed.
 
-`check_claims`, `check_clock` and `check_outputs` are called before and after searches: they compare
-a function of the user with the same function one period later, or at the mirrored state, and raise
-`DefinitionError` if the two differ. `explain` is called by `find.py` with the last *turn* of a
-search that failed (the flow from the section back to it), and returns the sentences of the error.
-*Sizes* of states are their characteristic magnitudes (`scale.py`).
+Before a search, `find.py` calls `check_periodic` and `check_clock`, and `guess.py` calls
+`check_claims`; after it, `find.py` calls `check_found` and `check_conserved`. All of them raise
+`DefinitionError`. `check_claims` compares each function of the user with the same function one to
+three periods later (a further function is added in `_functions` and `_all`), relative to its values
+and to rounding, so that units have no effect: this must stay. `check_outputs` is for results that
+take outputs, as those of sections and experiments. `explain` is called by `find.py` with the last
+*turn* of a search that failed (the flow from the section back to it), and returns the sentences of
+the error. *Sizes* of states are their characteristic magnitudes (`scale.py`).
+
+If a good system is refused, look at `_compare` (its period), `check_jumps` (a field that jumps) or
+`_conserved_outputs`; if a wrong period passes, at `_functions` and the times in `check_claims`; if
+an error has the wrong reason, at `_about_orbit` and `_why_not_converged`.
 """
 
 from collections.abc import Callable, Iterator

@@ -9,7 +9,8 @@ If these derivatives are equal, as for events that do not influence each other, 
 *commute*, and the flow is differentiable.
 
 `find.py`, `limit_cycles.py` and `flow.py` call `commutes` or `groups_on`. Coinciding events are
-found by `groups_on`, and every order of them is computed by `_orders`.
+found by `groups_on`, and every order of them is computed by `_orders`. `rivals.py` asks the same of
+recorded turns, in programs, too: both must stay with the same limit, `TOGETHER`.
 
 If events count as simultaneous and are not, look at `groups_on` and at `TOGETHER`
 (`systems/transition.py`); if an event is not counted, at `_missed` and `_rivals`. If their effect

@@ -7,7 +7,9 @@ flow, interrupted at events, so that no series is truncated (N. M. Wereley, Anal
 linear periodically time varying systems, MIT 1991).
 
 `LimitCycle.htf` calls `continuous_htf`; `_transfer` does the work. A *piece* is a part of the cycle
-between events, with `NODES` nodes.
+between events, with `NODES` nodes. Frequencies are in cycles per period, and phases are those of
+the clock, or count from the anchor without one (`LinearFlow.after`): this convention is that of
+`HTF`, and must stay.
 
 If a response is wrong at all frequencies, look at `LinearFlow.driven`; if it is wrong at high ones
 alone, at `longest_piece`; if it is wrong between computed frequencies, at `_interpolation`; if
@@ -166,6 +168,11 @@ def _transfer(
     interpolation: tuple[Array, Array, Array],
     harmonics: tuple[int, ...],
 ) -> Complex[Array, "M F ny nu"]:
+    """The HTFs of M harmonics at F frequencies. First come the integrals of outputs that inputs and
+    states at phase 0 cause; then the states at phase 0 are chosen so that the response is periodic.
+
+    **Arguments:** `interpolation`: see `_interpolation`.
+    """
     s = map.structure
     xp = namespace(flow.q)
     z = s.resolve_outputs(outputs)

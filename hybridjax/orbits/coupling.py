@@ -3,8 +3,10 @@ equal cycle.
 
 `Responses.coupling` calls `mean_effect`, which returns a `Coupling`: a Fourier series over the lead
 of the push. The coefficients are products of those of the push and of the phase response, from
-integrals over the cycle (`_quadrature`). To first order in the strength of the push, the zeros of
-the series are the states in which phases move together (`Locked`).
+integrals over the cycle (`_quadrature`). The effect is the mean of response(phase) times push(phase
++ lead), in cycles per time: this sign and this unit must stay, since `locked` and `locking` use
+them. To first order in the strength of the push, the zeros of the series are the states in which
+phases move together (`Locked`).
 
 If coefficients are wrong at high harmonics alone, look at `_quadrature`; if they are wrong for
 inputs that act at events alone, at the last terms of `mean_effect`; if a locked state is missing,
@@ -80,6 +82,7 @@ class Coupling(Showable, eqx.Module):
         **Arguments:** `mutual`: whether the push comes from an equal cycle that is pushed in
         return. Default: False.
         """
+        # (The lead of the push falls while the phase of the cycle advances: hence the sign.)
         c = to_host(self.coefficients)
         return Coupling(np.conj(c) - c if mutual else -c)._zeros()
 

@@ -3,8 +3,12 @@
 
 Users make them and give them to `find_limit_cycle`, `flow` and families of sections. `to_section`
 turns one into the `Target` at which the engine ends a flow. The *level* of a crossing is a function
-that falls through zero at the section: if a section is crossed in the wrong direction, look at
-`Crossing.level`.
+that falls through zero at the section, which must stay: the engine looks for falls alone. A further
+kind of section needs a case in `SectionLike`, in `to_section`, and wherever code asks for
+`AtEvent`.
+
+If a section is crossed in the wrong direction, look at `Crossing.level`; if it is not met in a
+chart, at `Crossing.in_chart`; if it is refused without need, at `check`.
 """
 
 import dataclasses
@@ -159,7 +163,8 @@ def as_section(section: SectionLike) -> Crossing | AtEvent:
 
 
 class ListLevels(AbstractLevels):
-    """The level functions of the crossings in a list of sections."""
+    """The level functions of the crossings in a list of sections. Events in the list, and the index
+    -1, which stands for no section, have the level 1, which never falls."""
 
     items: tuple[Crossing | AtEvent, ...]
 

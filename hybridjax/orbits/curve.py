@@ -3,8 +3,12 @@ return map.
 
 `Curve.step` predicts the next point along the tangent, and `Curve._correct` finds it by Newton's
 method; `branches.py` chooses the lengths of steps and looks for bifurcations between points. A
-branch that ends too early has its cause in `_correct`, whose reason is the `Result`. A *turn* is
-one application of the return map; *sizes* of states are their magnitudes (`scale.py`).
+vector z must stay the state followed by the parameter: all rows and tangents have this order. A
+*turn* is one application of the return map; *sizes* of states are their magnitudes (`scale.py`).
+
+A branch that ends too early has its cause in `_correct` or `_failure`, whose reason is the
+`Result`; one that turns back without need, in the tangent (`_settled`); a change of stability that
+is missed or invented, in `Point.tests`, to which a further test function is added.
 """
 
 import dataclasses
@@ -279,6 +283,8 @@ class Curve:
             return map.turn_with_jacobian(z[:-1], varied=varied)
 
     def _failure(self, turn: Turn, z: Float[np.ndarray, " n"]) -> Result | None:
+        """The reason why a turn cannot be one of the branch: it failed, has other events than the
+        first cycle, or meets its section too often. None for a good turn."""
         if int(turn.result) != Result.OK:
             return Result(int(turn.result))
         sequence = _rotated(turn.events)

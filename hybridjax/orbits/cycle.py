@@ -3,9 +3,13 @@
 `LimitCycle` is what searches return. It holds the numbers of the last *turn* (the flow once around
 the cycle), cut into *pieces*. All other results are computed at first use: multipliers here, from
 the Jacobians of the pieces (`factors`; or `fine_factors` if a piece contracts too much); responses,
-sensitivities, fluctuations and HTFs in files of these names. *Sizes* of states are their magnitudes
-(`scale.py`). A wrong cycle has its cause in the search (`find.py`, `newton.py`); `findings` are
-those of `verdict.py`.
+sensitivities, fluctuations and HTFs in files of these names. A further result is a method here that
+calls a file of its own with `_checked`. The fields must stay in their order: searches and sweeps
+make cycles from arguments by position. *Sizes* of states are their magnitudes (`scale.py`).
+
+A wrong cycle has its cause in the search (`find.py`, `newton.py`); `findings` are those of
+`verdict.py`. If multipliers are wrong, look at `_multipliers`, and at `fine_factors` if small ones
+are; if a cycle counts as changed and is not, at `what_changed`.
 """
 
 from collections.abc import Mapping
@@ -436,6 +440,10 @@ class LimitCycle(WithMultipliers, eqx.Module):
         return fluctuations(self._checked(), white or {}, guards or {}, resets or {})
 
     def _checked(self) -> "LimitCycle":
+        """The cycle with its arrays on the host, unless JAX traces it.
+
+        **Raises:** as `require_found` and `require_x64`.
+        """
         require_x64()
         self.require_found()
         return hosted(self)
@@ -594,6 +602,7 @@ def require_unchanged(
 
 
 def _differ(x: Any, y: Any) -> bool:
+    """Test whether an array of a system is another one than that for which the cycle was found."""
     # (If a parameter was replaced inside of a transformation, only this parameter is traced.)
     if is_tracer(x) or is_tracer(y):
         return not is_tracer(y)

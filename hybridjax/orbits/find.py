@@ -10,9 +10,14 @@ further attempts follow in this order:
    sooner;
 4. `_found_later`: attempts 1 to 3 from the state to which the flow leads after some periods.
 
-A cycle that is refused or accepted wrongly has its cause in `verdict.py` and `checks.py`. A *turn*
-is one application of the return map, and *sizes* of states are their magnitudes, relative to which
-errors are measured (`scale.py`).
+A further attempt is added in `_searched`, or in the function of its number. `check_found` must stay
+behind all attempts, since it checks the cycle that is returned. A *turn* is one application of the
+return map, and *sizes* of states are their magnitudes, relative to which errors are measured
+(`scale.py`).
+
+If a search fails without need, look at these attempts in turn. A cycle that is refused or accepted
+wrongly has its cause in `verdict.py` and `checks.py`; one that is inaccurate in a single state, in
+`_in_own_sizes`; one that belongs to an earlier call, in `_once`.
 """
 
 import dataclasses
@@ -290,6 +295,7 @@ def _once(
 
 
 def _remember(asked: tuple, cycle: LimitCycle) -> None:
+    """Keep a cycle as the newest one, and forget the oldest of too many."""
     _found[asked] = cycle
     if len(_found) > _REMEMBERED:
         oldest = next(iter(_found))
@@ -761,6 +767,7 @@ def _is_distant(map: ReturnMap, solution: Solution) -> bool:
 def _cycle(
     map: ReturnMap, solution: Solution, event_sequence: tuple[int, ...]
 ) -> LimitCycle:
+    """The cycle of a solution, with its numbers and its result as they are."""
     turn = solution.turn
     period = map.expected if map.base is None else turn.period
     return LimitCycle(

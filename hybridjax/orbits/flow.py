@@ -8,7 +8,10 @@
    `flow_program.py`, which takes many lanes and makes fewer checks.
 3. `_result` makes the `Flow`, and `_require_ends` raises the error of one that failed.
 
-Both ways of stage 2 must give the same numbers: compare them first if one is wrong.
+Both ways of stage 2 must give the same numbers: compare them first if one is wrong. If a start is
+refused, look at `_begun`; if an end is, at `_target_of`, to which a further kind of end is added.
+If an error should not be raised, look at the code in `result`, which `_require_ends` puts into
+words: codes come from the engine, from `_on_host`, and in programs from `flow_program._passage`.
 """
 
 import dataclasses

@@ -10,8 +10,11 @@ has. The program keeps a record of all moves (steps and jumps), from which deriv
 | more | `_FIRST_ROWS`, then 4 times as many until they suffice | the same |
 
 Which lanes form a part is decided in `_parts`, steps and derivatives are those of
-`engine/flow.py`, and codes that only programs set (`SECTION_MISSED`, `SIMULTANEOUS`, `BAD_INPUT`)
-come from `_passage`. If a flow is wrong in a program and right on the host, look there first.
+`engine/flow.py`, and the codes `SECTION_MISSED`, `SIMULTANEOUS` and `BAD_INPUT` come from
+`_passage`. Numbers of rows and parts must have no effect on results.
+
+If a flow is wrong in a program and right on the host, look at `_passage` first; if many flows need
+too much memory, at `_parts` and `_bytes_of_record`; if they are slow, at `_with_enough_rows`.
 """
 
 import dataclasses

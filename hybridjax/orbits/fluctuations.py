@@ -9,7 +9,12 @@ the cycle, at equal phases.
 `LimitCycle.fluctuations` calls `fluctuations`, and `_noisy` takes the stages in order: the effect
 of each *piece* of the cycle (a part between events) and of each event (`_pieces`), one period
 (`_around`), the stationary covariance (`_stationary`), and the covariance at the nodes
-(`_within_pieces`). A wrong covariance has its cause in `_pieces`.
+(`_within_pieces`). The order of the numbers in all vectors and matrices must stay: states, delay of
+the last event, durations (`_Pieces`).
+
+If covariances are wrong everywhere, look at `_pieces`; if they are wrong inside of pieces alone, at
+`_within_pieces`; if durations are wrong, at `_events` and the last rows of `jump` in `_pieces`; if
+the diffusion is, at `_diffusion`; if a stable cycle is refused, at `_stationary`.
 """
 
 from collections.abc import Mapping
@@ -166,6 +171,9 @@ class _Events(NamedTuple):
 def _noisy(
     cycle: Any, flow: LinearFlow, white: Any, guards: Any, resets: Any
 ) -> Fluctuations:
+    """The fluctuations, from the linear flow. One period without fluctuations at its beginning
+    gives the effect and the noise of a turn; a second one, that begins with the stationary
+    fluctuations, gives the covariances on the way."""
     map = cycle.return_map
     s = map.structure
     xp = namespace(flow.q)

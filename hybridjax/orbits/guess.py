@@ -2,7 +2,8 @@
 
 `return_map_near` takes the stages in order: it checks the guess, estimates the magnitudes of the
 states and simulates for `settle`. If no clock drives the system, it then flows to the section and
-back to it (`_on_section`). The time between gives the first guess of the period.
+back to it (`_on_section`). The time between gives the first guess of the period. The order of the
+stages must stay, since flows need the magnitudes.
 
 If a search begins at a wrong place, look at these stages in turn; if the section is not found, at
 `_next_crossing`; if a cycle gets an unsuitable section, at `_on_section`, and at
@@ -486,6 +487,7 @@ def _arrived(
 
 @host_first
 def _moved(map: ReturnMap, lanes: Lanes, target: Target) -> Moved:
+    """The flow of a lane to a target, of low accuracy, without inputs."""
     accuracy = np.array(TRANSIENT)
     settings = Settings(accuracy, accuracy, 1_000_000, map.scale)
     u = namespace(lanes.t).zeros((map.structure.nu, 1))

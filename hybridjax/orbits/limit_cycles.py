@@ -5,8 +5,12 @@ first follow the *itineraries* of known cycles, that is, their recorded sequence
 events (`many.py`). Systems that leave these itineraries, and those of the first small sweeps, are
 solved from the cycles of their neighbors by Newton's method with a search for events
 (`batches.py`). `examined` then tests events that coincide, and checks eight cycles by a second
-integration (all cycles, if one of the eight has a fault). If a cycle of a sweep differs from a
-search for it alone, compare these two ways.
+integration (all cycles, if one of the eight has a fault). `examined` must stay the last stage of
+both ways. A further field of `LimitCycles` is added where cycles are made: in `_on_routes`,
+`_cycles`, `_with_rows`, `LimitCycles.__getitem__`, and in `_stack` of `branches.py`.
+
+If a cycle of a sweep differs from a search for it alone, compare these two ways. If a cycle is
+refused after it was found, look at `examined`; if systems are exchanged, at `_with_rows`.
 """
 
 import collections
@@ -311,6 +315,7 @@ def solved(
     solver.run()
     cycles = _on_routes(systems, solver, tiles.map)
     together = _coincide(cycles, solver, tiles.map)
+    # Systems that follow no itinerary, from the cycles of their neighbors.
     left = solver.left
     if len(left):
         near = _some_known(cycles) if known is None else known
@@ -495,6 +500,7 @@ def as_cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
 
 
 def _cycles(tiles: Tiles, rounds: Rounds) -> LimitCycles:
+    """The last rounds of Newton's method as cycles, before they are examined."""
     turn = rounds.turn
     map = tiles.map
     return LimitCycles(
@@ -565,6 +571,11 @@ def _spread(rows: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
 
 
 def _stacked(systems) -> HybridSystem:
+    """Systems, given in one of the two forms of `find_limit_cycles`, as one system whose arrays
+    have a leading axis.
+
+    **Raises:** `DefinitionError` for systems that do not belong together, or have no parameters.
+    """
     first, *_ = [systems] if isinstance(systems, HybridSystem) else [*systems, None]
     if first is not None and not arrays_of(first):
         raise DefinitionError(

@@ -5,8 +5,11 @@ sensitivities are computed from it. The recorded steps of the last *turn* (the f
 cycle) are divided into *pieces*, which end at events, with `NODES` nodes in each. The states at the
 nodes come from shorter steps of the same method, and the field is linearized there. Deviations
 (`forward`) and their adjoints (`adjoint`) then follow from linear collocation equations, without
-further integration. At events, they are multiplied by the saltation matrix (`Jumps`). If a response
-is wrong everywhere, look at `_implicit`; if it is wrong after events, at `_jumps`.
+further integration. At events, they are multiplied by the saltation matrix (`Jumps`). Two things
+must stay: no event lies inside of a piece, and states are padded to the largest chart.
+
+If a response is wrong everywhere, look at `_implicit`; if it is wrong after events, at `_jumps`; if
+its derivatives by parameters are wrong, at `_along`; if it loses digits, at `NODES` and `_STEPS`.
 """
 
 import dataclasses
@@ -67,6 +70,7 @@ class Rule(NamedTuple):
 
 @ft.lru_cache
 def rule() -> Rule:
+    """Lobatto's rule with `NODES` nodes."""
     legendre = np.polynomial.legendre
     unit = np.eye(NODES)
     derivatives = [legendre.legder(e) for e in unit]
@@ -405,6 +409,8 @@ def linear_flow(
 
 
 def with_inputs(system: HybridSystem, parameter: str | None) -> Structure:
+    """The structure of a system, with its inputs, or with a change of the parameter as the only
+    input."""
     return Structure(system) if parameter is None else Varied(system, parameter)
 
 
@@ -483,6 +489,8 @@ def _linear_flow(
     of = with_inputs(map.system, parameter)
     d = s.d
     period = float(map.expected)
+    # Times and states at which the recorded moves begin. (Derivatives are taken by complex steps:
+    # their tangents are small imaginary parts.)
     lanes, tape = last_turn(cycle)
     moves = recorded_moves(lanes, tape)
     end = map.anchor.t[0] + period
@@ -603,6 +611,7 @@ def of_flow(tangents: Any) -> Any:
 
 
 def _flow_along(arguments: tuple, by: tuple) -> tuple[LinearFlow, LinearFlow]:
+    """The linear flow, and its derivatives in the directions `by` of the cycle."""
     cycle, longest, parameter = arguments
     return _linear_flow(cycle, longest, parameter), _linear_flow(
         cycle, longest, parameter, by[0]

@@ -2,11 +2,12 @@
 
 An *itinerary* is the sequence of charts, steps and events of a cycle, and a `Route` has that of a
 known cycle (`repeat.py`). `limit_cycles.py` makes a `Solver` and calls `run`. All systems first
-follow the route of the guess by Newton's method (`_take`). A system that leaves the route or does
-not converge begins again from a neighbor whose cycle is known, and follows the neighbor's route. If
-no route suits, a search finds one more cycle, whose route is tried for the remaining systems.
-Systems that still have no cycle are left to `batches.py`. A *lane* is one system of a call, and a
-*leg* a part between two events.
+follow the route of the guess by Newton's method (`_take`). A system that does not converge begins
+again from a neighbor whose cycle was found on the same route; a system that leaves the route waits
+for another one. Searches then find further cycles, whose routes are tried for the remaining
+systems. Systems that still have no cycle are left to `batches.py`. A *lane* is one system of a
+call, and a *leg* a part between two events. Two things must stay: a cycle counts only after a
+second integration (`Many.attempt`), and `Found.path` is an index into `Solver.itineraries`.
 
 If a cycle is wrong, look at `repeat.py`; if many systems are left over, at `Solver.nearest` and the
 constants, which limit rounds and searches.

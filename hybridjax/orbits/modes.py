@@ -1,9 +1,12 @@
 """Floquet multipliers with right and left eigenvectors of the monodromy matrix, with derivatives.
 
 `responses.py` calls `modes_of`. The eigenvectors of LAPACK, without derivatives, are starts of one
-step of Newton's method (`_mode`), which adds them. If a multiplier or a derivative is wrong, look
-at `_newton_step`; if a mode has the wrong scale, at `_scaled`; if modes are missing or in another
-order, at `modes_of`.
+step of Newton's method (`_mode`), which adds them. The order and the scale of the modes are those
+that `Responses` promises, and must stay.
+
+If a multiplier or a derivative is wrong, look at `_newton_step`; if a mode has the wrong scale, at
+`_scaled`; if modes are missing or in another order, at `modes_of`; if multipliers are said to
+coincide and do not, at `_mode`.
 """
 
 from typing import NamedTuple

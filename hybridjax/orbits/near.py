@@ -5,8 +5,12 @@ charts, steps and events (`repeat.py`). There are four functions: `traced_cycle`
 of users; `derived_cycle` for derivatives outside of programs; `repeated_cycle` for calls that
 repeat with other parameters; `first_order_cycle` for fits. Each follows the route by Newton's
 method, in one compiled program. A cycle that leaves the route has a result code inside of programs,
-and is left to the search outside of them. If a cycle is wrong here and right from a search, look at
-`repeat.py`.
+and is left to the search outside of them. `traced_cycle` and `first_order_cycle` must not ask for
+values of the system, which JAX hides.
+
+If a cycle is wrong here and right from a search, look at `repeat.py`; if there is a search although
+the route would suit, at `route_near` and at the two constants; if derivatives are wrong, at
+`correct` (`repeat.py`) and at which of them `_found` asks for.
 """
 
 import collections
@@ -65,6 +69,8 @@ _WORTH_COMPILING = 4.0
 # Number of derivatives outside of programs after which their program is compiled, which takes as
 # long as these. Fewer: the same wait. More: derivatives stay slow for longer.
 _DERIVATIVES_WORTH_COMPILING = 24
+# Routes by cycle; known cycles by those that were found beside them; numbers of derivatives and CPU
+# seconds of searches, by class of systems.
 _routes = Memory()
 _beside = Memory()
 _calls: collections.Counter = collections.Counter()

@@ -5,8 +5,8 @@
 which consists of *moves* (steps with the events at their ends). Steps are taken, and convergence is
 tested, in *sizes* of the states (their magnitudes, `scale.py`). `search` lists the attempts: a
 further kind of attempt, such as a restart from a random state, is added there. On the host,
-`_root_on_host` has the iteration; inside of programs of JAX, `_root`. Derivatives of the result are
-implicit (`_root_jvp`, `_solve_along`).
+`_root_on_host` has the iteration; inside of programs of JAX, `_root`. Both must keep the same
+tolerances (`ATOL`, `RTOL`). Derivatives of the result are implicit (`_root_jvp`, `_solve_along`).
 
 If a search fails without need, look at the attempts in turn; if its result depends on the executor,
 compare the two iterations. If a derivative is wrong, look at `_solve_along`, and inside of programs
@@ -124,6 +124,7 @@ def _first_turn(map: ReturnMap) -> Return:
 
 
 def _solve(map: ReturnMap, once_more: bool, _: bool, near: Any) -> Solution:
+    """See `solve`. (The argument without a name is `factors`, which only derivatives use.)"""
     q, turn, steps = root(map, MAX_STEPS, near)
     if (
         on_host(q) or not once_more
@@ -153,6 +154,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     sizes = map.sizes
     if map.conserved or not solution.is_fixed_point:
         raise NotOnHostError
+    # How the beginning and the ends of pieces move in P directions.
     P = len(jax.tree_util.tree_leaves(by)[0])
     levels = None if ends.levels is None else ListLevels((by.base,))
     s = kernels.Tangents(map.structure, by.structure, ends.levels, levels, P)
@@ -173,6 +175,7 @@ def _solve_along(arguments: tuple, directions: tuple) -> tuple[Solution, Solutio
     each = np.tile(jacobian, (P, 1, 1))
     begin[1:] = (newton_steps(each, moved) * sizes).T
     tangents = orbit.tangents(begin)
+    # From the moved state: the period, and with `factors`, the pieces and their Jacobians.
     nothing = jax.tree_util.tree_map(lambda _: None, solution)
     longer_period = tangents[-1, 0] - begin[0]
     moving = nothing.turn._replace(period=longer_period)
@@ -217,6 +220,7 @@ def solve(
 
 @on_the_host
 def _solve_damped(map: ReturnMap) -> Solution:
+    """The end of Levenberg-Marquardt steps from the anchor's state."""
     q, turn, steps = _damped(map)
     return Solution(
         map.departure(q), turn._replace(record=None), steps, map.judge(q, turn)

@@ -2,7 +2,11 @@
 
 `has_period` is called by searches, verdicts and programs that repeat a cycle. It compares fields,
 guards, resets, predicates and schedules at some points with those one period later, and returns one
-truth value (`checks.py` names the function that differs, outside of programs).
+truth value (`checks.py` names the function that differs, outside of programs). A further function
+of users is added in `_values`. The test must not ask for values, since JAX traces it, too.
+
+If a system is refused whose functions repeat, look at the differences that `has_period` allows; if
+one passes whose functions do not repeat, at `_values`, `LATER`, and `_schedules_fit` for schedules.
 """
 
 import jax

@@ -8,8 +8,11 @@ integrates once more, by another method, as a check. `near.py` (single cycles), 
 and `fitting/` call these functions.
 
 A *turn* is the flow once around the cycle, a *leg* a part of it between two events, and a *lane*
-one of many systems side by side. A wrong cycle comes from `_corrected`; a cycle that is given up
-without need, from `judge` or `agrees`.
+one of many systems side by side. No trajectory may leave its itinerary unnoticed: a further way to
+do so needs a flag in `judge` (or in `Plan.code`), or its systems are excluded in `has_route`.
+
+A wrong cycle comes from `_corrected`; wrong derivatives, from `_solved_jvp` or
+`_root_and_period_jvp`; a cycle that is given up without need, from `judge` or `agrees`.
 """
 
 import dataclasses
@@ -322,6 +325,11 @@ def _newton(map: ReturnMap, factors, residual, q):
 
 
 def _corrected(maps: Maps, plan: Plan, q, ends) -> Corrected:
+    """The loop of Newton's method: one turn and one step of all lanes, until all have settled. A
+    lane that has settled keeps its last turn.
+
+    **Arguments:** as of `correct`.
+    """
     # (Steps are judged relative to `RTOL`.)
     rtol = maps.map.settings.rtol
     assert rtol is not None

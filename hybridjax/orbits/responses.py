@@ -11,7 +11,9 @@ Ch. 8; D. Wilson, J. Moehlis, Phys. Rev. E 94, 2016).
 cycle (P pieces of K nodes, see `linear_flow.py`) and returns a `Responses`. A *push* is a brief
 input or a jump of a state; a *covector* is the response to all states. The multipliers and modes
 are in `modes.py`, the effect of a periodic push in `coupling.py`, the phase of states that are not
-near the cycle in `asymptotic_phase.py`. `PhaseCurve` is also the type of measured responses.
+near the cycle in `asymptotic_phase.py`. `PhaseCurve` is also the type of measured responses. The
+normalizations above must stay, and so must `Responses.of_phase` in units of time: other files use
+both.
 
 If Z is wrong everywhere, look at `closing`, which gives it at phase 0; if it is wrong away from
 phase 0, at `LinearFlow.covectors`. If an amplitude has the wrong scale everywhere, look at
@@ -264,6 +266,10 @@ class Responses(Showable, eqx.Module):
         return name, namespace(by_input).sum(products, axis=-1)
 
     def _covector(self, mode: int | None) -> Inexact[Array, "P K d"]:
+        """The response of the phase (for None), or of the amplitude of a mode, to all states.
+
+        **Raises:** `DefinitionError` for the phase of a clock, and for a mode that does not exist.
+        """
         if mode is None:
             if self.of_phase is None:
                 raise DefinitionError(
@@ -279,6 +285,7 @@ class Responses(Showable, eqx.Module):
     def _named(
         self, covector: Inexact[Array, "P K d"], phase: Phases, scale: Array = 1.0
     ) -> dict[str, Array]:
+        """A response at some phases, times `scale`, by names of states and inputs."""
         flow = self.flow
         s = self.structure
         xp = namespace(flow.q)
@@ -297,6 +304,7 @@ def responses(cycle: Any, modes: int | None) -> Responses:
 
 @one_program
 def _responses(cycle: Any, flow: LinearFlow, modes: int | None) -> Responses:
+    """The responses, from the linear flow: those at phase 0 first, then those along the cycle."""
     host = on_host(flow.t)
     xp = namespace(flow.t)
     map = cycle.return_map
@@ -404,6 +412,7 @@ def effect_of_pushes(s: Structure, flow: LinearFlow) -> Float[Array, "P K d d"]:
 
 
 def _returned(a: int, s: Structure, t, q, u):
+    """The derivative of the state of chart a after a push by the push, padded and in one row."""
     chart = s.charts[a]
     effect = jnp.eye(len(q))
     if isinstance(chart, SlidingChart):

@@ -8,7 +8,9 @@ are the factors of the monodromy matrix. *Sizes* of states are their magnitudes 
 
 Searches call `ReturnMap.turn` and `turn_with_jacobian`, and get a `Return` or a `Turn`. There are
 two ways to the same Jacobians, which must agree: `_linear_on_host` (NumPy) and `_linear_in_program`
-(JAX). `judge` decides whether a turn is a cycle, and returns the reason if it is none.
+(JAX). `judge` decides whether a turn is a cycle, and returns the reason if it is none. There, each
+reason replaces the reasons before it: their order must stay, and so must the sign of the residual,
+P(q) - q, on which all of Newton's methods rely.
 
 If a turn is wrong, compare these two ways; if both are wrong in the same way, look at `travel`, and
 at the search. If a good turn is refused, look at `judge`, and the limits `SINGULAR` and `CLOSED`;
@@ -685,6 +687,9 @@ class ReturnMap(eqx.Module):
         )
 
     def _meetings(self, pieces: Lanes, codes: Int[Array, "K R"]) -> Int[Array, ""]:
+        """Number of crossings of the section (see `Turn`): how often its event happens, or how
+        often its level falls through zero between pieces and at the end of the turn. With a clock,
+        as many as are wanted."""
         xp = namespace(codes)
         shape = codes.shape[:-2]
         if self.base is None:

@@ -3,7 +3,8 @@
 For each event, `rivals_of` returns a *rival*: a transition that nearby trajectories may meet before
 this event, or instead of it. All code that asks whether events coincide uses this rule: searches,
 sweeps and programs. Outside of programs, `coincidence.commutes` then compares the orders in which
-rivals may happen.
+rivals may happen. A further cause of a rival is added in `rivals_of`, which must not ask for values
+of its arrays, since JAX traces it, too.
 
 If a cycle is refused because events coincide, and they do not, look at `rivals_of` (its three
 causes) and at `at_one_time`; if an event at the beginning of the turn is overlooked, at

@@ -2,10 +2,11 @@
 
 Errors are measured in sizes, so that no result depends on the user's units. Searches call
 `sizes_near` before the cycle is known and `sizes_on` once it is known; `scale_of` puts sizes into
-`Settings.scale`. Each name of a state has one size in all charts. On a cycle, it is the largest
-modulus of the state. Before the cycle is known, it is the change of the state, by the field at the
-guess, in the time of the fastest mode or of the clock. A size is at least large enough that
-rounding errors of the field do not count: this matters for states that a symmetry keeps at zero.
+`Settings.scale`. Each name of a state must have one size in all charts, since `sizes_of` reads it
+from the first chart that has the state. On a cycle, it is the largest modulus of the state. Before
+the cycle is known, it is the modulus at the guess, plus the change of the state by the field there
+in the time of the fastest mode or of the clock. A size is at least large enough that rounding
+errors of the field do not count: this matters for states that a symmetry keeps at zero.
 
 `stiff_charts` and `slow_time` estimate time scales from the eigenvalues of the field's derivative.
 
@@ -253,6 +254,7 @@ class _Fields(NamedTuple):
 
 
 def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
+    """The field at K points of any charts, padded with zeros."""
     zeros = np.zeros(q.shape)
     derivative = np.zeros((s.d, *q.shape))
     out = _Fields(zeros, zeros.copy(), derivative, zeros.copy())
@@ -268,6 +270,8 @@ def _fields(s: Structure, chart: Int[np.ndarray, " K"], t, q) -> _Fields:
 
 
 def _fields_of_chart(s: Structure, a: int, t, q) -> _Fields:
+    """The field at K points of chart a. Its rounding errors follow from shifts of states and times:
+    what a smooth field would change by them is subtracted."""
     n, K = q.shape
     times, states = _shifted(t, q)
     u = np.zeros((s.nu, 1))

@@ -5,7 +5,9 @@ shape response curve, and the changes of the times between events are local timi
 Wang, J. P. Gill, H. J. Chiel, P. J. Thomas, SIAM J. Appl. Dyn. Syst. 20, 2021).
 
 `LimitCycle.sensitivity` calls `sensitivity`. `_sensitivity` drives the linear flow of the cycle
-(`linear_flow.py`) with a constant input, and closes it over one period (`responses.closing`).
+(`linear_flow.py`) with a constant input, and closes it over one period (`responses.closing`). Phase
+0 must stay on the section of the cycle, or at the anchor's phase of the clock: times and shapes are
+relative to it.
 
 If the derivative of the period is wrong, look at `closing`, and with a clock at
 `by_parameter_of_period`. If only those of times of events are, look at the delays of
@@ -90,6 +92,7 @@ def sensitivity(cycle: Any, parameter: str) -> Sensitivity:
 
 @one_program
 def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
+    """The derivatives, from the linear flow with the parameter as its input."""
     map = cycle.return_map
     period = cycle.period
     events = cycle.event_sequence
@@ -100,6 +103,7 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
     # The parameter is an input of frequency 0; the other columns are those of the state at phase 0.
     constant = xp.ones((*flow.t.shape, 1))
     starts, late, total = (x[..., 0] for x in flow.driven(constant))
+    # The derivative of the period: by the phase response Z, or that of the clock.
     both = map.valid[:, None] & map.valid
     whole = xp.where(both, total[:, 1:], 0.0)
     closed, Z = closing(map, whole, f0)
@@ -111,6 +115,8 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
                 "the cycle has a multiplier of 1, and no derivative by a parameter: follow its "
                 "branch by `continuation`."
             )
+    # The change of the state at phase 0 with which the turn closes; from there, the changes at the
+    # nodes, and of the times of events.
     change_of_end = total[:, 0] + f0 * longer
     begin = xp.linalg.solve(closed, -change_of_end)
     starts = starts[..., 0] + starts[..., 1:] @ begin
@@ -125,8 +131,10 @@ def _sensitivity(cycle: Any, flow: LinearFlow, varied: Varied) -> Sensitivity:
             ahead = by_state @ begin + by_parameter
         change = change + ahead * flow.field
         late = late - ahead
+    # Changes at equal phases, in place of equal times.
     part = flow.after(map) / period * longer
     change = change + flow.field * part[..., None]
+    # Pieces that end in events: these are as many as there are events.
     place = xp.argsort(flow.event < 0, stable=True)[: len(events)]
     times = late[place]
     next_times = xp.concatenate([times[1:], times[:1] + longer])

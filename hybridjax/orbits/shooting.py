@@ -6,8 +6,9 @@ if its next fall through zero is an event. *Sizes* are magnitudes of states.
 
 If a nearby turn was recorded, all its moves are computed side by side from other starts:
 `fixed_point` changes the starts until the moves join to a cycle; `travel` then makes each move by
-the search, to see that it is still right. This needs few calls of compiled functions, instead of
-one call for every step. (Multiple shooting: H. G. Bock and K. J. Plitt, IFAC Proceedings 17, 1984.)
+the search, to see that it is still right (its result must keep the form of `ReturnMap.travel`).
+This needs few calls of compiled functions, instead of one call for every step. (Multiple shooting:
+H. G. Bock and K. J. Plitt, IFAC Proceedings 17, 1984.)
 
 A wrong Newton step comes from `_changes`. If a turn is refused without need, there are three
 places: `_forwards` (a move would have a negative duration), `_searched` (a move fails, or ends in

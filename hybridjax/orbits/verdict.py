@@ -14,8 +14,10 @@ rounding errors. It does not notice a guard that dips below zero and back betwee
 walk (eight in each step), wrong multipliers of systems with more than `_MANY` states, or functions
 that do not mean what their author meant.
 
-Each finding has a function that makes it: if a good cycle is refused or a fault passes, look at
-that function and at the constants, which say what counts as a difference.
+Each finding has a function that makes it, called in `_verdict`, or in `_jump` for an event: a
+further check is added there. If a good cycle is refused or a fault passes, look at that function
+and at the constants, which say what counts as a difference. The walk must keep a method and steps
+of its own: otherwise both integrations have the same faults.
 """
 
 from collections.abc import Iterable
@@ -190,6 +192,8 @@ def visits_of(cycle) -> list[Visit]:
 
 
 def _verdict(cycle) -> Verdict:
+    """All checks: of events, guards and schedules; then, if the walk is accurate, of its distance
+    and of shorter periods; last, of multipliers, if nothing is refused."""
     s = cycle.structure
     period = float(cycle.period)
     scale = np.asarray(cycle.settings.scale)
