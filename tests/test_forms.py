@@ -93,6 +93,7 @@ def test_a_flow_begins_on_a_cycle(hopper, cycle):
     assert_array_equal(hj.flow(hopper, cycle, 1.0).state, long.state)
 
 
+@pytest.mark.slow
 def test_a_flow_has_its_states_by_name(hopper):
     at_end = hj.flow(hopper, STATE, 0.3)
     names = hopper.charts()["flight"].states
@@ -104,6 +105,7 @@ def test_a_flow_has_its_states_by_name(hopper):
     assert_array_equal(many["ym"], many.state[:, 2])
 
 
+@pytest.mark.slow
 def test_a_state_by_name_has_derivatives(hopper):
     def height(k, pick):
         return pick(hj.flow(hopper.replace(k=k), STATE, 0.5))
@@ -131,6 +133,7 @@ def test_one_time_needs_no_list(hopper):
     assert_array_equal(end.at(0.3)[1], states[0])
 
 
+@pytest.mark.slow
 def test_parameters_of_a_sweep_are_keywords(hopper, cycle):
     values = {"k": [9.9, 10.0], "b": [5.0]}
     long = hj.sweep(hopper, values, guess=cycle)
@@ -138,6 +141,7 @@ def test_parameters_of_a_sweep_are_keywords(hopper, cycle):
     assert hj.sweep(hopper, {"k": [9.9, 10.0]}, guess=cycle, b=5.0).identical(long)
 
 
+@pytest.mark.slow
 def test_the_parameter_of_a_continuation_is_a_keyword(cycle):
     long = hj.continuation(cycle, "k", (9.95, 10.05), step=1.0)
     short = hj.continuation(cycle, k=(9.95, 10.05), step=1.0)
@@ -160,6 +164,7 @@ def test_an_event_of_a_recording_is_the_beginning_by_its_name(walk):
         identified(walk, "vM")
 
 
+@pytest.mark.slow
 def test_a_recording_is_read_from_its_file(tmp_path, walk):
     path = tmp_path / "walk.csv"
     walk.to_pandas().to_csv(path, index=False)
@@ -168,6 +173,7 @@ def test_a_recording_is_read_from_its_file(tmp_path, walk):
     assert_array_equal(identified(str(path)), long)
 
 
+@pytest.mark.slow
 def test_a_recording_is_made_of_a_table(walk):
     table = walk.to_pandas()
     long = identified(hj.Recording.from_frame(table))
@@ -302,6 +308,7 @@ def test_all_signals_but_the_inputs_are_checked(walk):
     assert short.findings == long.findings
 
 
+@pytest.mark.slow
 def test_a_study_takes_a_table_and_the_options_of_each_recording(
     tmp_path, monkeypatch, walk
 ):
@@ -344,6 +351,7 @@ def test_a_field_that_is_no_parameter_says_how_to_make_it_one():
         hj.sweep(Plain(), gain=[1.0, 2.0])
 
 
+@pytest.mark.slow
 def test_a_state_of_a_cycle_begins_at_its_time(hopper, cycle):
     """A hopper has a clock: from the same state at time 0 it would leave the cycle."""
     (t,) = cycle.anchor.t

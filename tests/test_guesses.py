@@ -643,6 +643,7 @@ OSCILLATOR = hj.HybridSystem.from_functions(
 )
 
 
+@pytest.mark.slow
 def test_the_place_of_rest_prints_no_rounding():
     with pytest.raises(hj.errors.ComputationError, match="x 0, v 0, where nothing"):
         hj.find_limit_cycle(OSCILLATOR, hj.Guess("main", (1.0, 0.0)))
@@ -859,6 +860,7 @@ def test_tables_hold_the_numbers(names):
     assert_allclose(one["multipliers.0.modulus"], names["cycle"].modulus[0])
 
 
+@pytest.mark.slow
 def test_a_system_from_functions_is_that_of_a_class():
     rate = 2 * jnp.pi
     juggler = hj.HybridSystem.from_functions(

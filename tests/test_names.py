@@ -75,6 +75,7 @@ def test_each_name_has_one_place():
     assert repeated == []
 
 
+@pytest.mark.slow
 def test_no_class_has_the_name_of_another():
     named = Counter()
     for file in (ROOT / "hybridjax").rglob("*.py"):

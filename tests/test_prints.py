@@ -161,6 +161,7 @@ def test_results_print_briefly(
     assert "u (N) -> yM (m), vM (m/s)" in repr(hopper_data)
 
 
+@pytest.mark.slow
 def test_results_show_pages(hopper_cycle, placed_kinematic, kinematic_ldtp):
     m = kinematic_ldtp
     end = BranchEnd(1.0, hj.errors.Result.OK, "the <values> end")

@@ -681,6 +681,7 @@ def test_a_module_of_a_user_may_have_the_name_of_one_of_python(name, tmp_path):
 
 
 @pytest.mark.parametrize("runner", ["cProfile", "profile", "pdb"])
+@pytest.mark.slow
 def test_what_a_script_changes_is_seen_under_a_runner(runner, tmp_path):
     text = SCRIPT.format(imports="", helper="float.__abs__", change="K = 3.0")
     text = text.replace("float.__abs__(q[0])", "q[0]")

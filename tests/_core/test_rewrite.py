@@ -10,6 +10,7 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 import hybridjax as hj
@@ -172,6 +173,7 @@ def rotation(angle):
     return jnp.array([[c, -s], [s, c]])
 
 
+@pytest.mark.slow
 def test_a_zoo_of_functions_gives_what_it_gave_before():
     """Values and derivatives of both orders of nesting, over 16 lanes."""
     rng = np.random.default_rng(0)

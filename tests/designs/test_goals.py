@@ -222,6 +222,7 @@ def test_several_models_that_do_not_fit_together(three):
         hj.optimal_design([], usual)
 
 
+@pytest.mark.slow
 def test_draws_have_the_covariance_of_the_fit():
     model = with_angle(1.0)
     design = hj.multisine(N, 32, frequencies=(0, 2), amplitude=0.05)

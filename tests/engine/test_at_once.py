@@ -106,6 +106,7 @@ BESIDE_FULL = (1 - 2.0**-40, 1 - 2.0**-53, 1.0, 1 + 2.0**-52)
 
 @pytest.mark.parametrize("by_rough_turns", [True, False])
 @pytest.mark.parametrize("chart, ramp", [("on", 0.2), ("on", 0.9), ("off", 0.9)])
+@pytest.mark.slow
 def test_full_duty_is_refused_by_name_from_any_guess(
     chart, ramp, by_rough_turns, monkeypatch
 ):
@@ -120,6 +121,7 @@ def test_full_duty_is_refused_by_name_from_any_guess(
             hj.find_limit_cycle(Converter(duty), guess)
 
 
+@pytest.mark.slow
 def test_full_duty_is_refused_beside_a_cycle_whose_comparator_never_trips():
     guess = hj.Guess("on", (0.3, 0.2), time=0.9)
     cycle = hj.find_limit_cycle(Converter(1.05), guess)

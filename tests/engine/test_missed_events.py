@@ -140,6 +140,7 @@ def test_two_dips_within_a_step(depth):
     assert_allclose(times(found), [first, second], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_guard_that_is_faster_than_the_state():
     """Steps are long where the state is linear in time, but the guard turns 80 times."""
 

@@ -825,6 +825,7 @@ def test_each_of_several_events_that_coincide_happens_once(n):
     assert found.result == Result.SIMULTANEOUS
 
 
+@pytest.mark.slow
 def test_many_events_that_coincide_are_not_called_zeno():
     """Their orders are too many to compare."""
     start = hj.Guess("main", jnp.zeros(14))

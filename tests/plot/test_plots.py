@@ -239,6 +239,7 @@ def test_bodes(estimate, exact, rational):
         hj.plot.bode(families, fits={"c": rational})
 
 
+@pytest.mark.slow
 def test_fits_are_drawn_beside_htfs_and_alone(hopper, estimate, structured):
     """Also those of results, in lists and by name."""
     beside = hj.plot.bode(estimate, structured).axes[0, 0]

@@ -133,6 +133,7 @@ def test_numbers_of_sections(hopper_cycle):
 
 
 @pytest.mark.usefixtures("compiles_none")
+@pytest.mark.slow
 def test_a_converter():
     """Events that are scheduled by a parameter."""
     cycle = hj.find_limit_cycle(hj.models.BuckConverter())

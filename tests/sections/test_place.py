@@ -273,6 +273,7 @@ def place_or_say(cycle, family, monkeypatch):
 
 
 @pytest.mark.parametrize("name", slow_but(hj.models.__all__, ("VerticalHopper",)))
+@pytest.mark.slow
 def test_sections_from_the_recorded_turn_are_those_of_the_flow(name, monkeypatch):
     """The same places, steps and errors as one section after the other."""
     system = getattr(hj.models, name)()
@@ -328,6 +329,7 @@ def states_of(tape):
     return states[np.asarray(tape.code).T >= 0]
 
 
+@pytest.mark.slow
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     (impact, *_) = wheel.trajectory().events

@@ -43,6 +43,7 @@ def model_of(system, known, family):
 
 
 @pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.slow
 def test_a_traced_model_is_that_outside_of_the_program(name, known, no_search):
     family = FAMILIES[name]
     system = hj.models.VerticalHopper(k=1.02 * HOPPER.k, b=0.97 * HOPPER.b)

@@ -133,6 +133,7 @@ def test_a_parameter_inside_of_a_cycle_is_not_differentiated():
     assert_allclose(model.A[:, 0, 0], expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
     changed = eqx.tree_at(lambda x: x.system.k, hopper_cycle, jnp.asarray(20.0))
     with pytest.raises(hj.errors.DefinitionError, match="with this one as the guess"):
@@ -142,6 +143,7 @@ def test_the_advice_to_find_a_changed_cycle_again_holds(hopper_cycle):
     assert_allclose(again.multipliers, other.multipliers, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_was_made_before_follows_the_code_or_is_refused(monkeypatch):
     cycle = hj.find_limit_cycle(
         Slowed(), settings=hj.orbits.Settings(solver=hj.systems.Radau())

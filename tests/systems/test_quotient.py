@@ -102,6 +102,7 @@ STRIDE = pytest.param(2, {}, hj.Crossing("left", "falling"), marks=pytest.mark.s
 @pytest.mark.parametrize(
     "steps, symmetry, section", [(1, MIRROR, hj.AtEvent("right lands")), STRIDE]
 )
+@pytest.mark.slow
 def test_a_step_modulo_the_symmetry_and_a_stride_of_two(steps, symmetry, section):
     walker = hj.systems.Symmetric(Full(), **symmetry, translation=("x",))
     cycle = hj.find_limit_cycle(walker, section=section)
@@ -175,6 +176,7 @@ class Biased(hj.models.Duffing):
         return super()._line(t, q, u + self.bias)
 
 
+@pytest.mark.slow
 def test_the_symmetry_is_that_of_all_systems_in_all_units():
     def half(x):
         return hj.systems.Symmetric(Biased(beta=5e16, amplitude=5e-10, bias=x), **ODD)
