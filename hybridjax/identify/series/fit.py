@@ -4,7 +4,7 @@ error).
 `_fit_open_loop` takes the stages in order: a first c by regression (`delayed_outputs.py`), the
 minimum of the output error (`linearization.minimize`), a second minimum with outputs in units of
 their noise, the covariance of c from blocks of cycles (`_uncertainty`; `jackknife` if residuals are
-distortion), and findings about order, drift and feedback. (c are the coefficients of the
+distortion, or smaller than those of any sensor), and findings about order, drift and feedback. (c are the coefficients of the
 denominator chi.) With references, `in_loop.py` takes the place of the first four. A wrong
 multiplier has its cause in the minimum, a wrong error bar in `block_scores`.
 """
@@ -89,7 +89,7 @@ from .records import (
     start_responses,
     with_drift,
 )
-from .residuals import WIDENED, about_answers, is_distorted
+from .residuals import WIDENED, about_answers, is_distorted, is_quiet
 
 
 _BIASED = "the fit is biased; name their `references`"
@@ -414,6 +414,7 @@ def _fit_open_loop(
     distortion = []
     if is_distorted(grid, error, predicted, fit.coefficients):
         distortion = [WIDENED]
+    if distortion or is_quiet(grid, error, predicted):
         wider = jackknife(best.problem, best.solution, covariance)
         fit = dataclasses.replace(
             fit, covariance=wider.matrix, covariance_dof=wider.dof

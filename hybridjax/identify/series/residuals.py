@@ -56,6 +56,9 @@ _ALONE = 4.0
 # Smaller level, larger part: distortion passes, and standard errors are too small.
 _DISTORTED = 3e-3
 _LEAST_DISTORTION = 0.08
+# Residuals below this part of the responses are those of no sensor. Larger: intervals of recordings
+# with little noise are too wide. Smaller: those of simulated recordings are too small.
+_QUIET = 0.01
 # The largest number of patterns of a cycle of which products are taken, the number of shifts that
 # are compared, and the fewest cycles. More patterns: slow responses are lost among others. Fewer
 # shifts or cycles: the level is not held.
@@ -265,6 +268,23 @@ def is_exact(grid: CycleGrid, error: Signals) -> Bool[np.ndarray, " ny"]:
     square_of_outputs = (grid.y**2).sum(axis=(0, 1, 2))
     size = np.sqrt(square_of_outputs)
     return left <= 1e3 * ROUNDING * size  # (iterations leave as much of exact data)
+
+
+def is_quiet(grid: CycleGrid, error: Signals, predicted: Signals) -> bool:
+    """Return whether residuals are smaller than those of any sensor, though larger than rounding
+    errors.
+
+    Then they are distortion by nonlinearity, too small a part of the responses to be found in them
+    by `is_distorted`. This is so for simulated recordings without noise.
+
+    **Arguments:** `error`, `predicted` outputs, on `grid`.
+    """
+    if is_exact(grid, error).any():
+        return False
+    left = np.nansum(error**2, axis=(0, 1, 2))
+    of_responses = np.where(grid.sampled, predicted, 0.0)
+    size = (of_responses**2).sum(axis=(0, 1, 2))
+    return bool((left < _QUIET**2 * size).all())
 
 
 def about_misfit(
