@@ -269,6 +269,22 @@ def test_designs_as_tables(tmp_path, wave):
     assert experiments.n_sections == 8
 
 
+def test_a_command_that_a_long_gap_ends_is_reported(tmp_path, wave):
+    """Cycles are not counted across it, so that the place in the table is unknown."""
+    design = hj.multisine(8, 16, frequencies=(0.1, 0.4), experiments=1)
+    design.write(tmp_path / "phase.csv", cycles=19)
+    time, values = wave.trials[0].time, wave.trials[0].values.copy()
+    values[len(time) // 2 :][:200] = np.nan
+    recording = hj.Recording(time, dict(zip(wave.signals, values.T, strict=True)))
+    phase = hj.recordings.estimate_phase(recording, CIRCLE)
+    assert len(phase.stretches[0]) == 2
+    told = hj.recordings.attach_design(recording, phase, tmp_path / "phase.csv")
+    assert np.isnan(told["u"][len(time) // 2 + 200 :]).all()
+    (finding,) = told.findings
+    assert finding.cause == "command unknown"
+    assert f"after {time[len(time) // 2 - 1]:.6g} s" in finding.text
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory, rhythm):
     folder = tmp_path_factory.mktemp("trials")
