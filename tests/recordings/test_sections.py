@@ -1,5 +1,6 @@
 """Section data against closed forms, its masks, tables of designs, and the command."""
 
+import dataclasses
 import html
 import json
 import re
@@ -111,6 +112,25 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
         diagnosis = hj.recordings.diagnose(data, fit)
         named = any(w.cause == "sampling" for w in diagnosis.findings)
         assert named == few
+
+
+def test_multipliers_of_no_convergence_need_no_power(rhythm):
+    """They are those at which the iteration stopped: no frequency to excite follows."""
+    data = sample(rhythm, inputs="force")
+    n = len(data.records[0].u)
+    slow = np.cos(2 * np.pi * 0.05 * np.arange(n) / data.n_sections)
+    records = (dataclasses.replace(data.records[0], u=slow[:, None]),)
+    data = eqx.tree_at(lambda d: d.records, data, records)
+    fit = hj.fit_series(data, 2, check=False)
+    fit = eqx.tree_at(lambda f: f.multipliers, fit, np.array([0.5j, -0.5j]))
+
+    def causes(result):
+        stopped = dataclasses.replace(fit, result=int(result))
+        return [x.cause for x in hj.recordings.diagnose(data, stopped).findings]
+
+    assert "weak excitation" in causes(hj.errors.Result.OK)
+    assert "weak excitation" not in causes(hj.errors.Result.NOT_CONVERGED)
+    assert "narrow excitation" in causes(hj.errors.Result.NOT_CONVERGED)
 
 
 def test_gaps_are_masked_and_cut(wave):
