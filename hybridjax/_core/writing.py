@@ -95,6 +95,13 @@ def results_folder(folder: Path, kind: str, names: Iterable[str]) -> Iterator[Pa
                 path.rmdir()
 
 
+def require_free(folder: Path, kind: str, names: Iterable[str]) -> None:
+    """**Raises:** `DefinitionError` if `results_folder` would refuse to write these results, before
+    they are computed."""
+    _refuse_link(folder)
+    _refuse_others(folder, names, _listed(folder, kind))
+
+
 def _put(new: Path, folder: Path, kind: str) -> None:
     names = {
         path.relative_to(new).as_posix() for path in new.rglob("*") if path.is_file()

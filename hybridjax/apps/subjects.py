@@ -39,7 +39,7 @@ from .._core.precision import enable_x64
 from .._core.progress import counted, working
 from .._core.showable import Showable
 from .._core.text import folded
-from .._core.writing import Format, results_folder
+from .._core.writing import Format, require_free, results_folder
 from ..errors import ComputationError, DefinitionError, HybridJaxError
 from ..identify.series.fit import SeriesFit
 from ..io import load
@@ -69,6 +69,8 @@ _COLUMNS = {
 }
 # Columns of the results that are printed. (The file has all.)
 _SHOWN = ["effect", "subjects", "estimate", "standard_error", "low", "high", "p"]
+# The name of the list of these files, by which a later call knows them.
+_POPULATION = "population"
 _FILES = ("subjects.csv", "population.csv", "population.html")
 _TESTS = (
     "The p value of each difference is that of one test: with several quantities, groups or "
@@ -235,8 +237,8 @@ def identify_subjects(
     and sentences in `failures`.
 
     **Raises:** `DefinitionError` for a table without these columns or rows, a subject in two
-    groups, a folder that cannot be written, and if pandas is not installed; `ComputationError` if
-    all subjects fail.
+    groups, a folder that cannot be written or holds other files of these names, and if pandas is
+    not installed; `ComputationError` if all subjects fail.
 
     **Example:**
 
@@ -256,6 +258,7 @@ def identify_subjects(
     rows = _rows(table)
     place = Path(table).parent if isinstance(table, str | os.PathLike) else Path()
     root = Path(folder)
+    require_free(root, _POPULATION, _files(formats))
     jobs: dict[str, Callable[[], str]] = {}
     reading: dict[str, Any] = {"time": time, "signals": tuple(signals) or None}
     for name, trials in rows.groupby("report", sort=False):
@@ -397,6 +400,12 @@ def _read(path: Path) -> Any:
         ) from None
 
 
+def _files(formats: tuple[Format, ...]) -> list[str]:
+    """Return the names of the files that `_write` may write."""
+    pairs = itertools.product(_FOREST, with_png(formats))
+    return [*_FILES, *(f"forest_{quantity}.{format}" for quantity, format in pairs)]
+
+
 def _write(
     study: SubjectStudy, methods: Iterable[str], formats: tuple[Format, ...]
 ) -> None:
@@ -415,7 +424,7 @@ def _write(
         *(f"<p>{escape(x)}</p>" for x in methods),
     ]
     subjects = population.table.assign(**population.values, **errors)
-    with results_folder(study.folder, "population", _FILES) as new:
+    with results_folder(study.folder, _POPULATION, _files(formats)) as new:
         for quantity, caption in _FOREST.items():
             with contextlib.suppress(DefinitionError):  # for too few subjects
                 figure = population.plot(quantity)

@@ -333,15 +333,36 @@ class ExperimentData(Showable, eqx.Module):
         first = self.result[::2]
         second = self.result[1::2]
         broken = first != Result.OK
-        failed_at = np.where(broken, self.failed_at[::2], self.failed_at[1::2])
-        error = np.maximum(self.error[::2], self.error[1::2])
+        simulated = self.simulated
+        if simulated is not None:
+            simulated = _of_pairs(simulated, broken)
         return dataclasses.replace(
             self,
             u=plus,
             y=(self.y[::2] - self.y[1::2]) / 2,
             result=np.where(broken, first, second),
-            simulated=Simulated(failed_at, error, self.label, findings=self.findings),
+            simulated=simulated,
         )
+
+
+def _of_pairs(simulated: Simulated, broken: Bool[np.ndarray, " P"]) -> Simulated:
+    """Return the results of pairs; the first member of those that are `broken` failed.
+
+    Errors and delays are the larger ones of both members.
+    """
+    first = 2 * np.arange(len(broken))
+    member = np.where(broken, first, first + 1)
+
+    def larger(x: Any) -> Any:
+        return None if x is None else np.maximum(x[::2], x[1::2])
+
+    return dataclasses.replace(
+        simulated,
+        failed_at=simulated.failed_at[member],
+        error=larger(simulated.error),
+        late=larger(simulated.late),
+        causes=tuple(simulated.causes[k] for k in member if simulated.causes),
+    )
 
 
 def summary(

@@ -200,7 +200,11 @@ def require_deviations(records: Sequence[SectionSeries]) -> None:
     with np.errstate(invalid="ignore"):
         power = np.nansum(values**2, axis=0)
         changes = np.nansum(deviations**2, axis=0) / power
-    of_inputs = changes[:nu].min()
+    # (An input of zeros changes no output.)
+    of_used = changes[:nu][power[:nu] > 0]
+    if not len(of_used):
+        return
+    of_inputs = of_used.min()
     # (If inputs nearly repeat, outputs may nearly repeat, too.)
     fixed = changes[nu:] < 0.01 * of_inputs**2
     if fixed.any():

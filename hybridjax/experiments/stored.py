@@ -31,10 +31,9 @@ from .._core.pieces.store import (
     Variable,
     ZarrStore,
     absolute,
-    flags,
+    result_flags,
 )
 from .._core.progress import working
-from .._core.results import Result
 from .._core.showable import Showable
 from .._core.signal import Signal, unit_of
 from ..engine.settings import EXPERIMENT
@@ -328,9 +327,7 @@ class ExperimentJob:
         variables = {
             "u": Variable("<f8", ("sample", "input"), (n, len(u))),
             "y": Variable("<f8", ("sample", "output"), (n, len(values.outputs.names))),
-            "result": Variable(
-                "<i8", attributes=flags([x.name.lower() for x in Result])
-            ),
+            "result": Variable("<i8", attributes=result_flags()),
             "failed_at": Variable("<i8"),
             "error": Variable("<f8"),
         }

@@ -25,7 +25,7 @@ from .._core.boundary.kinds import Order
 from .._core.showable import Showable
 from .._core.text import folded, number
 from ..errors import DefinitionError
-from ..experiments.data import ExperimentData, Simulated
+from ..experiments.data import ExperimentData
 from ..experiments.design.partition import line_class
 from .denominator import multipliers_of
 from .descent import Coefficients, positive, without
@@ -127,11 +127,14 @@ def remove_transient(data: ExperimentData, order: Order | None = None) -> Transi
     removed[data.ok] = np.sqrt(np.mean(window**2, axis=1))
     simulated = None
     if data.simulated is not None:
-        # (The numbers of events are left out, since some events lie in the cycles that were cut
-        # off.)
+        late = data.simulated.late
         later = np.maximum(data.failed_at - N, 0)
         failed_at = np.where(data.failed_at >= 0, later, -1)
-        simulated = Simulated(failed_at, data.error)
+        simulated = dataclasses.replace(
+            data.simulated,
+            failed_at=failed_at,
+            late=None if late is None else late[:, N:],
+        )
     data = dataclasses.replace(data, u=data.u[:, N:], y=clean, simulated=simulated)
     return TransientFit(data, multipliers_of(c), removed)
 

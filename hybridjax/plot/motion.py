@@ -312,7 +312,12 @@ def _beside(motion: Any, sections: Any, perturbed: Any) -> Trajectory | None:
     # (To import it takes a thirtieth of a second.)
     from ..experiments.motion import perturbed_trajectory
 
-    return perturbed_trajectory(sections, perturbed.u[0, : 4 * sections.n_sections])
+    u = perturbed.u[0, : 4 * sections.n_sections]
+    # (With feedback, the references follow the inputs of the system.)
+    inputs = motion.structure.inputs
+    if perturbed.inputs[: len(inputs)] == inputs:
+        u = u[:, : len(inputs)]
+    return perturbed_trajectory(sections, u)
 
 
 def _tracks(

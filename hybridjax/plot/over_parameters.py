@@ -43,7 +43,7 @@ def branch(
 
     - `branches`: results of `hj.continuation`, all along the same parameter.
     - `output`: name of a state or output, whose largest value on each cycle is drawn. Default: the
-      first state of the chart in which the cycle begins.
+      first state of the chart in which the first cycle begins.
     - `ax`: one Axes. Default: a new figure of one column's width.
 
     **Returns:** `hj.plot.Plot` with `axes` (1, 1), parameter and output in their units.
@@ -65,14 +65,14 @@ def branch(
         raise DefinitionError(
             f"branches in one figure need one parameter, not {sorted(names)}."
         )
+    first = branches[0][0]
+    chart = int(first.anchor.chart[0])
+    name = first.structure.charts[chart].states[0] if output is None else output
     with panels(ax) as axes:
         panel = axes[0, 0]
         shown = set()
         drawn = set()
         for b, color in zip(branches, itertools.cycle(CYCLE)):
-            chart = int(b[0].anchor.chart[0])
-            first = b[0].structure.charts[chart].states[0]
-            name = first if output is None else output
             height = b.largest(name)
             for part, stable in _parts(b):
                 line = "-" if stable else "--"
@@ -95,10 +95,9 @@ def branch(
         for line, label in (("-", "stable"), ("--", "unstable")):
             if line in drawn:
                 panel.plot([], [], line, color=COLORS["gray"], label=label)
-        parameter = Signal(
-            b.parameter, unit_of_parameter(branches[0][0].system, b.parameter)
-        )
-        (output_name,) = branches[0][0].structure.resolve_outputs(name).names
+        (along,) = names
+        parameter = Signal(along, unit_of_parameter(first.system, along))
+        (output_name,) = first.structure.resolve_outputs(name).names
         panel.set(xlabel=axis_of(parameter), ylabel=f"largest {axis_of(output_name)}")
         panel.locator_params(axis="x", nbins=6)
         legend_above(panel)

@@ -17,12 +17,13 @@ import numpy as np
 from .._core.arguments import require_equal
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath
+from .._core.findings import Finding
 from ..errors import FileFormatError
 from ..experiments.design.tables import BY_PHASE
 from .formats.columns import Wanted
-from .phase import Phase
+from .phase import Phase, Winding
 from .read import RecordingLike, as_recording, read_tables
-from .recording import Recording
+from .recording import Recording, Trial
 
 
 @checked
@@ -40,7 +41,8 @@ def attach_design(recording: RecordingLike, phase: Phase, path: FilePath) -> Rec
     - `path`: a table by phase that `Design.write` wrote.
 
     **Returns:** `hj.Recording` with the same trials and the commanded inputs as further signals, in
-    the units of the design.
+    the units of the design. The command is NaN after an interruption of
+    the phase (a long gap, a missed event), with a finding.
 
     **Raises:** `FileFormatError` if the file is no table by phase, or has experiments of different
     lengths; `DefinitionError` if the numbers of trials and experiments differ, or the recording has
@@ -84,8 +86,11 @@ def attach_design(recording: RecordingLike, phase: Phase, path: FilePath) -> Rec
     trials = []
     for s, (trial, stretches) in enumerate(phase.by_trial(recording)):
         added = np.full((len(trial.time), len(names)), np.nan)
+        findings = []
         if stretches:
             first = stretches[0]
+            if len(stretches) > 1:
+                findings.append(_after_gap(trial, first))
             now = first.at(trial.time)
             during = np.isfinite(now)
             first_whole = np.ceil(first.phase[0])
@@ -93,7 +98,18 @@ def attach_design(recording: RecordingLike, phase: Phase, path: FilePath) -> Rec
             last = command.shape[1] - 1
             added[during] = command[s, np.clip(section + 1, 0, last)]
         signals = dict(zip(names, added.T, strict=True))
-        commanded = Recording(trial.time, signals, name=trial.name)
+        commanded = Recording(trial.time, signals, name=trial.name, findings=findings)
         measured = recording.with_trials([trial])
         trials.append(Recording.beside([measured, commanded]))
     return Recording.join(trials)
+
+
+def _after_gap(trial: Trial, stretch: Winding) -> Finding:
+    """Return the finding about the samples of a trial after its first stretch."""
+    stop = stretch.time[-1]
+    count = int((trial.time > stop).sum())
+    text = (
+        f"trial '{trial.name}': the command is unknown in {count} samples after {stop:.6g} s, "
+        "where its phase is interrupted, as cycles are not counted from there on."
+    )
+    return Finding("command unknown", text, "left out")

@@ -231,8 +231,10 @@ def _about_excitation(
     band: Sequence[float],
 ) -> Iterator[Finding]:
     f, power = input_spectrum(data)
+    # (Without convergence, the multipliers are those of the last step.)
+    found = _upper(fit.multipliers) if fit.result == Result.OK else ()
     for name, edge, strength in zip(fit.inputs, band, power.T, strict=True):
-        for z in _upper(fit.multipliers):
+        for z in found:
             at = abs(np.angle(z)) / (2 * np.pi)
             shifted = f[:, None] - [at, -at]
             distance = np.abs((shifted + 0.5) % 1 - 0.5).min(axis=1)

@@ -18,7 +18,6 @@ import numpy as np
 
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import FilePath, SignalNames
-from .._core.findings import Finding
 from ..errors import DefinitionError, FileFormatError
 from .formats.arrays import (
     read_arrow,
@@ -191,11 +190,8 @@ def _recording(path: Path, wanted: Wanted, units: dict[str, str]) -> Recording:
     trial = whole.trials[0]
     findings = list(whole.findings)
     for name, at in events.items():
-        events[name] = check_events(f"'{path}'", name, at, trial.time)
-        lost = int(np.isfinite(at).sum()) - len(events[name])
-        if lost:
-            text = f"{lost} events '{name}' outside of the recording were left out."
-            findings.append(Finding("events outside", text, "left out"))
+        events[name], outside = check_events(f"'{path}'", name, at, trial.time)
+        findings += outside
     return Recording(
         trial.time,
         dict(zip(whole.signals, trial.values.T, strict=True)),

@@ -137,7 +137,8 @@ class Recording(Showable, eqx.Module, metaclass=Leading):
           `time`, as `from_frame` takes it, can replace times and signals.
         - `signals`: inputs and outputs by name, (n,) each; NaN where a sample is missing. Series
           of pandas must have the same index, and their samples the same order.
-        - `events`: times of events by name, such as foot strikes.
+        - `events`: times of events by name, such as foot strikes. Those outside of the recording
+            are left out, with a finding.
         - `units`: units by name. `name`: name of the trial. `findings` about the data.
 
         **Raises:** `DefinitionError` for arrays that do not fit together, time that repeats or runs
@@ -169,9 +170,11 @@ class Recording(Showable, eqx.Module, metaclass=Leading):
             raise DefinitionError(
                 f"{where}: '{min(both)}' is a signal and an event: rename one."
             )
+        outside: list[Finding] = []
         for key, values in happened.items():
-            happened[key] = np.sort(values[~np.isnan(values)])
-            check_events(where, key, happened[key], time)
+            within, lost = check_events(where, key, values, time)
+            happened[key] = np.sort(within)
+            outside += lost
         values = np.stack(list(columns.values()), axis=1)
         self.trials = (
             Trial(
@@ -183,7 +186,7 @@ class Recording(Showable, eqx.Module, metaclass=Leading):
         )
         self.signals = tuple(columns)
         self.units = tuple(units.get(key, "") for key in columns)
-        self.findings = tuple(findings)
+        self.findings = (*findings, *outside)
 
     @classmethod
     def from_frame(
@@ -590,9 +593,9 @@ def check_events(
     name: str,
     at: Series,
     time: Float[np.ndarray, " m"],
-) -> Float[np.ndarray, " k"]:
-    """Return the events within the recording. (One sample before its start, or after its end, is
-    allowed.)
+) -> tuple[Float[np.ndarray, " k"], list[Finding]]:
+    """Return the events within the recording, and a finding if others were left out. (One sample
+    before its start, or after its end, is allowed.)
 
     **Raises:** `DefinitionError` if all events lie outside.
     """
@@ -603,7 +606,12 @@ def check_events(
             f"{where}: all events '{name}' ({at[0]:.6g} s, ...) are outside of the recording "
             f"({time[0]:.6g} to {time[-1]:.6g} s): check their unit."
         )
-    return at[within]
+    findings = []
+    lost = len(at) - int(within.sum())
+    if lost:
+        text = f"{lost} events '{name}' outside of the recording were left out."
+        findings.append(Finding("events outside", text, "left out"))
+    return at[within], findings
 
 
 def _near(at: Series, time: Series) -> Any:

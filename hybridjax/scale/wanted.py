@@ -14,8 +14,7 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 
-from .._core.pieces.store import Constant, Variable, flags
-from .._core.results import Result
+from .._core.pieces.store import Constant, Variable, flags, result_flags
 from .._core.signal import unit_of
 from ..errors import ComputationError, DefinitionError
 from ..orbits.cycle import LimitCycle
@@ -65,9 +64,9 @@ class Wanted:
             values[name] = self._first(cycles, name, measure)[None]
         dims = {"state": ("state_name",), "multipliers": ("multiplier",)}
         attributes = {
-            "result": flags([x.name.lower() for x in Result]),
+            "result": result_flags(),
             "period": {"units": self._time_unit} if self._time_unit else {},
-            "chart": flags(self._charts),
+            "chart": flags({name: code for code, name in enumerate(self._charts)}),
         }
         variables = {}
         for name, array in values.items():

@@ -70,3 +70,23 @@ def test_failed_experiments_are_named():
         .summary()
         .endswith("and 4 more")
     )
+
+
+def test_pairs_keep_the_causes_and_delays_of_a_plant():
+    u = np.array([[1.0], [-1.0]] * 2)[..., None] * np.ones((4, 8, 1))
+    codes = hj.errors.Result
+    result = [codes.OK, codes.PLANT_STOPPED, codes.OK, codes.OK]
+    late = np.arange(32.0).reshape(4, 8)
+    about = dict(n_sections=4, periods=2)
+    simulated = Simulated(
+        np.array([-1, 3, -1, -1]), late=late, causes=("", "it fell", "", "")
+    )
+    data = hj.experiments.ExperimentData(
+        u, u, result=result, simulated=simulated, **about
+    )
+    odd = data.odd_part()
+    assert odd.summary() == "1/2 ok; #0: section 3, cycle 0: it fell"
+    assert_allclose(odd.simulated.late, np.maximum(late[::2], late[1::2]))
+    # Without a simulation there is none, as for measured data.
+    measured = hj.experiments.ExperimentData(u, u, **about)
+    assert measured.odd_part().simulated is None

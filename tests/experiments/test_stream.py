@@ -1,5 +1,7 @@
 """Many experiments: chunk by chunk, in batches, by threads, in stores. One program is compiled."""
 
+import json
+import pathlib
 import shutil
 
 import equinox as eqx
@@ -133,6 +135,26 @@ def test_stored_experiments_are_those_of_the_whole(made, whole):
     found = hj.estimate_htf(made).H
     expected = hj.estimate_htf(whole).H
     assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_labels_of_results_name_their_codes(stored):
+    """Code 2 is not in use, so that codes after it are not the positions of their names."""
+    Result = hj.errors.Result
+
+    def labels():
+        flags = StoredExperiments(stored.address).dataset.result.attrs
+        return dict(
+            zip(flags["flag_meanings"].split(), flags["flag_values"], strict=True)
+        )
+
+    expected = {code.name.lower(): int(code) for code in Result}
+    assert labels() == expected
+    # A store of an earlier version has the positions.
+    file = pathlib.Path(stored.address) / "result" / "zarr.json"
+    about = json.loads(file.read_text())
+    about["attributes"]["flag_values"] = list(range(len(Result)))
+    file.write_text(json.dumps(about))
+    assert labels() == expected
 
 
 def test_only_what_is_missing_or_damaged_is_run(stored, arguments, whole, tmp_path):

@@ -423,6 +423,17 @@ def test_absolute_outputs_are_refused(small):
     assert error.max() < 1e-9
 
 
+def test_absolute_outputs_are_refused_beside_an_input_of_zeros():
+    """Parameters are also fitted to experiments in which one input was not used."""
+    u = np.random.default_rng(0).normal(size=(1, 40, 2)) * [1, 0]
+    deviations = np.cumsum(u[..., :1], axis=1)
+    cycle = 1e3 * np.tile([[0], [1], [2], [1]], (10, 1))
+    about = dict(n_sections=4, periods=10)
+    data = hj.experiments.ExperimentData(u, deviations + cycle, **about)
+    with pytest.raises(hj.errors.DefinitionError, match="subtract the limit cycle"):
+        hj.fitting.ObservedSeries(data, hj.ClockPhase(4))
+
+
 @pytest.mark.parametrize("unit", [1e-12, 1e9])
 def test_inputs_have_units_of_their_own(unit):
     """The HTFs are those of the same data in other units. Inputs that are equal are refused."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hybridjax as hj
+from hybridjax.experiments.data import Simulated
 
 from ..linear.conftest import hopper as hopper
 
@@ -63,10 +64,16 @@ def test_failed_experiments_stay_out(hopper, full):
     y = data.y.copy()
     result[2] = hj.errors.Result.BLOW_UP
     y[2, 50:] = np.nan
+    causes = ["" for _ in result]
+    causes[2] = "it fell"
+    failed_at = np.where(result, 50, -1)
+    plant = Simulated(failed_at, late=y[..., 0], causes=tuple(causes))
     data = hj.experiments.ExperimentData(
-        data.u, y, n_sections=32, periods=12, result=result
+        data.u, y, n_sections=32, periods=12, result=result, simulated=plant
     )
     fit = hj.identify.remove_transient(data, 2)
+    assert "#2: section 18, cycle 0: it fell" in fit.data.summary()
+    np.testing.assert_array_equal(fit.data.simulated.late, y[:, 32:, 0])
     assert np.isnan(fit.removed[2]).all()
     assert np.isfinite(fit.removed[3]).all()
     estimate = hj.estimate_htf(fit.data, 0)

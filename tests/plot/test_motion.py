@@ -1,6 +1,7 @@
 """Animations: frames on the trajectory, feet that stay, loops that close, files, refusals."""
 
 import base64
+import dataclasses
 import io
 import re
 
@@ -106,3 +107,9 @@ def test_no_input_gives_the_cycle():
         assert motion.figure.bbox.y1 > x.title.get_tightbbox().y1
     with pytest.raises(hj.errors.DefinitionError, match="and their `sections`"):
         hj.plot.animate(cycle, perturbed=data)
+    # Experiments with feedback have their references after the inputs.
+    u, r = np.zeros((1, 8, 1)), np.ones((1, 8, 1))
+    names = (*cycle.structure.inputs, "r")
+    looped = dataclasses.replace(data, u=np.concatenate([u, r], axis=2), inputs=names)
+    again = hj.plot.animate(cycle, sections=placed, perturbed=looped)
+    assert again.interval * len(again.times) == shown

@@ -14,6 +14,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import hybridjax as hj
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate
 
+from ..toys import Field
+
 
 def labeled(ax):
     """Lines by label, without the helpers that matplotlib or the axes hide."""
@@ -191,6 +193,33 @@ def test_a_branch_lists_the_lines_that_it_draws():
     branch = hj.continuation(cycle, "mu", (0.1, 0.12), step=0.5)
     legend = branch.plot().ax.get_legend()
     assert [text.get_text() for text in legend.get_texts()] == ["stable"]
+
+
+@pytest.mark.slow
+def test_branches_of_several_systems_have_one_output():
+    """The default is that of the first, though another system begins with another state."""
+
+    class Renamed(hj.models.HopfOscillator):
+        names = ("v", "x")
+
+        def charts(self):
+            return {"plane": Field(self.names, self._plane)}
+
+    class Unlike(Renamed):
+        names = ("p", "q")
+
+    def along_mu(system):
+        cycle = hj.find_limit_cycle(system)
+        return hj.continuation(cycle, "mu", (0.1, 0.12), step=0.5)
+
+    branches = along_mu(hj.models.HopfOscillator()), along_mu(Renamed())
+    ax = hj.plot.branch(*branches).ax
+    assert ax.get_ylabel() == "largest x"
+    drawn = [line for line in ax.get_lines() if len(line.get_xdata())]
+    for line, branch in zip(drawn, branches, strict=True):
+        assert_array_equal(line.get_ydata(), branch.largest("x"))
+    with pytest.raises(hj.errors.DefinitionError, match="no output 'x'"):
+        hj.plot.branch(branches[0], along_mu(Unlike()))
 
 
 def bodes(*given, **options):

@@ -1,5 +1,6 @@
 """Files of each kind, written by the library of their kind, and what is refused in one sentence."""
 
+import struct
 import sys
 import tracemalloc
 
@@ -622,6 +623,16 @@ def test_texts_in_tables(tmp_path):
     rows[5] = rows[5].replace("0.05", "12:00:05")
     path.write_text("\n".join(["x,time,phase", *rows]))
     refused("column 'time' holds '12:00:05", path)
+
+
+@pytest.mark.parametrize("last", [0, 2**16 - 1])  # (counted, or too many to be counted)
+def test_c3d_without_frames(tmp_path, last):
+    path = tmp_path / "empty.c3d"
+    pytest.importorskip("ezc3d").c3d().c3d_swig.write(str(path))
+    content = bytearray(path.read_bytes())
+    content[6:10] = struct.pack("<HH", 1, last)
+    path.write_bytes(content)
+    refused("has no frames", path)
 
 
 def test_c3d_that_is_longer_than_its_header_can_say(tmp_path):

@@ -466,6 +466,14 @@ def test_a_table_of_files(tmp_path, rhythm, monkeypatch, capsys):
     assert "S0-a failed" not in printed
 
 
+@pytest.mark.parametrize("name", ["population.csv", "forest_decay.png"])
+def test_a_foreign_file_is_refused_before_any_subject(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    table = {"file": ["S1.csv"], "subject": ["S1"]}
+    with pytest.raises(hj.errors.DefinitionError, match=f"{name}' is in the way"):
+        hj.identify_subjects(table, tmp_path, lambda recording: 1 / 0)
+
+
 def write_subjects(folder, rhythm):
     """Write recordings of six subjects in two groups, and a table that names a seventh, too."""
     rows = ["file,subject,group,age"]

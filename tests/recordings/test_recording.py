@@ -38,6 +38,16 @@ def test_bad_recordings(time, signals, options, message):
         hj.Recording(time, signals, **options)
 
 
+def test_events_outside_of_the_samples_are_left_out():
+    """As in files. An event one sample after the end is allowed."""
+    time = np.arange(0.0, 10.0, 0.1)
+    hits = [1.0, 10.0, 25.0, np.nan]
+    recording = hj.Recording(time, {"x": time}, events={"hit": hits})
+    np.testing.assert_array_equal(recording.trials[0].events["hit"], [1.0, 10.0])
+    (finding,) = recording.findings
+    assert finding.text == "1 events 'hit' outside of the recording were left out."
+
+
 def test_trials_must_belong_together():
     one = hj.Recording(T, GOOD, units={"a": "N"}, name="one")
     signals = {"b": T, "a": T}

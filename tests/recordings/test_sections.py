@@ -1,5 +1,6 @@
 """Section data against closed forms, its masks, tables of designs, and the command."""
 
+import dataclasses
 import html
 import json
 import re
@@ -111,6 +112,25 @@ def test_outputs_that_repeat_and_few_samples_are_named(rhythm):
         diagnosis = hj.recordings.diagnose(data, fit)
         named = any(w.cause == "sampling" for w in diagnosis.findings)
         assert named == few
+
+
+def test_multipliers_of_no_convergence_need_no_power(rhythm):
+    """They are those at which the iteration stopped: no frequency to excite follows."""
+    data = sample(rhythm, inputs="force")
+    n = len(data.records[0].u)
+    slow = np.cos(2 * np.pi * 0.05 * np.arange(n) / data.n_sections)
+    records = (dataclasses.replace(data.records[0], u=slow[:, None]),)
+    data = eqx.tree_at(lambda d: d.records, data, records)
+    fit = hj.fit_series(data, 2, check=False)
+    fit = eqx.tree_at(lambda f: f.multipliers, fit, np.array([0.5j, -0.5j]))
+
+    def causes(result):
+        stopped = dataclasses.replace(fit, result=int(result))
+        return [x.cause for x in hj.recordings.diagnose(data, stopped).findings]
+
+    assert "weak excitation" in causes(hj.errors.Result.OK)
+    assert "weak excitation" not in causes(hj.errors.Result.NOT_CONVERGED)
+    assert "narrow excitation" in causes(hj.errors.Result.NOT_CONVERGED)
 
 
 def test_gaps_are_masked_and_cut(wave):
@@ -267,6 +287,22 @@ def test_designs_as_tables(tmp_path, wave):
     experiments = data.experiments(periods=16)
     assert experiments.u.shape[1] % 8 == 0
     assert experiments.n_sections == 8
+
+
+def test_a_command_that_a_long_gap_ends_is_reported(tmp_path, wave):
+    """Cycles are not counted across it, so that the place in the table is unknown."""
+    design = hj.multisine(8, 16, frequencies=(0.1, 0.4), experiments=1)
+    design.write(tmp_path / "phase.csv", cycles=19)
+    time, values = wave.trials[0].time, wave.trials[0].values.copy()
+    values[len(time) // 2 :][:200] = np.nan
+    recording = hj.Recording(time, dict(zip(wave.signals, values.T, strict=True)))
+    phase = hj.recordings.estimate_phase(recording, CIRCLE)
+    assert len(phase.stretches[0]) == 2
+    told = hj.recordings.attach_design(recording, phase, tmp_path / "phase.csv")
+    assert np.isnan(told["u"][len(time) // 2 + 200 :]).all()
+    (finding,) = told.findings
+    assert finding.cause == "command unknown"
+    assert f"after {time[len(time) // 2 - 1]:.6g} s" in finding.text
 
 
 @pytest.fixture(scope="module")

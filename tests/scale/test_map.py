@@ -50,6 +50,7 @@ def test_a_map_has_the_multipliers_of_the_closed_form(whole):
     assert whole.spectral_radius.dims == ("slope", "spokes")
     assert (whole.result == 0).all()
     assert (whole.residual < 1e-8).all()
+    assert 2 not in whole.result.attrs["flag_values"]  # (a code that is not in use)
     assert whole.slope.attrs["units"] == "rad"
     assert_array_equal(
         np.abs(whole.multipliers).max("multiplier"), whole.spectral_radius

@@ -29,6 +29,7 @@ from .. import limits
 from ..arguments import package
 from ..exceptions import DefinitionError, FileFormatError
 from ..progress import counted
+from ..results import Result
 from .description import difference
 
 
@@ -95,9 +96,14 @@ class Variable(NamedTuple):
         return -1 if np.dtype(self.dtype).kind == "i" else np.nan
 
 
-def flags(names: Sequence[str]) -> dict[str, Any]:
-    """Return the attributes of integers from 0 on that stand for names."""
-    return {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
+def flags(codes: Mapping[str, int]) -> dict[str, Any]:
+    """Return the attributes of integers that stand for names, from the code of each name."""
+    return {"flag_values": list(codes.values()), "flag_meanings": " ".join(codes)}
+
+
+def result_flags() -> dict[str, Any]:
+    """Return the attributes of a variable with codes of `Result`, which are not consecutive."""
+    return flags({x.name.lower(): int(x) for x in Result})
 
 
 Constant = tuple[Sequence[str], np.ndarray, Mapping[str, Any]]
@@ -279,6 +285,9 @@ class ZarrStore:
         known = {*dims, *self._arrays}
         beside = sorted({*data.coords, *data.data_vars} - known)
         description = json.dumps(self.layout.description)
+        # (Older stores count the names of results, though codes are not consecutive.)
+        if "flag_values" in getattr(data.get("result"), "attrs", {}):
+            data["result"].attrs |= result_flags()
         return data[[*dims, *self._arrays, *beside]].assign_attrs({_ABOUT: description})
 
     def _chunks(self, k: int) -> list[str]:

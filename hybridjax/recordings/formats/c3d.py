@@ -44,7 +44,7 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
     Times count from the first frame of the capture, as those of events do: a trimmed file begins
     later than 0.
 
-    **Raises:** `FileFormatError` for a damaged or truncated file.
+    **Raises:** `FileFormatError` for a damaged or truncated file, and for one without frames.
     """
     ezc3d = package("ezc3d")
     with reading(path, "C3D file"):
@@ -52,6 +52,8 @@ def read_c3d(path: Path, wanted: Wanted) -> list[Columns]:
         header = _read_header(path)
     data = file["data"]
     frames = data["points"].shape[2]
+    if not frames:
+        raise FileFormatError(f"'{path}' has no frames: export the capture again.")
     if header.frames is None:
         _refuse_frames_beyond(path, frames, data, header)
     check_rows(path, frames, header.frames, "frames")
