@@ -4,9 +4,9 @@ error).
 `_fit_open_loop` takes the stages in order: a first c by regression (`delayed_outputs.py`), the
 minimum of the output error (`linearization.minimize`), a second minimum with outputs in units of
 their noise, the covariance of c from blocks of cycles (`_uncertainty`; `jackknife` if residuals are
-distortion, or smaller than those of any sensor), and findings about order, drift and feedback. (c are the coefficients of the
-denominator chi.) With references, `in_loop.py` takes the place of the first four. A wrong
-multiplier has its cause in the minimum, a wrong error bar in `block_scores`.
+distortion, or smaller than those of any sensor), and findings about order, drift and feedback. (c
+are the coefficients of the denominator chi.) With references, `in_loop.py` takes the place of the
+first four. A wrong multiplier has its cause in the minimum, a wrong error bar in `block_scores`.
 """
 
 import dataclasses
