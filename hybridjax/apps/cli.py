@@ -3,7 +3,8 @@
 `main` reads the options and calls the function of a command (`_reproduce`, `_identify`, `_sweep`).
 Nothing heavy is imported before the arguments are known to be good, so imports stand inside of
 these functions, and must stay there. An option is added in the `_add_...` of its command, with a
-converter made by `_option`, which also has the words of its error. If a good option is refused,
+converter made by `_option`, which also has the words of its error; one of `identify` is used in
+`steps_of` of `identify.py`. If a good option is refused,
 look at its converter. Options that contradict each other are refused in `_identify` and
 `_require_signals`. If an error is printed with its traceback, it is no `HybridJaxError`, the only
 kind of which `main` makes a sentence.

@@ -160,9 +160,10 @@ class OptimalDesign(Showable, eqx.Module):
         rms = " and ".join(n for n in self.limited if n not in special)
         limits = " and ".join([f"rms of {rms}"] * bool(rms) + special)
         saved = float(f"{self.saved:.2g}")  # (a third digit differs between machines)
-        text = f"one cycle of this design replaces {saved:g} with {self.usual_name}."
         if self.saved > _WORTH_IT:
-            text = text
+            text = (
+                f"one cycle of this design replaces {saved:g} with {self.usual_name}."
+            )
         else:
             text = f"{self.usual_name} are nearly optimal."
         return f"With the {limits} limited, {text}"

@@ -5,7 +5,8 @@ rates; the search and the replay call `ChartFlow.locate` for the zero near a giv
 crossings get their times and derivatives. Whether a function has crossed zero within a step is
 decided in `search/accept.py`, and in `itinerary/flags.py` for trajectories that follow an
 itinerary. All watched functions are signed so that they fall at their event: with a wrong sign,
-events are missed or happen at once.
+events are missed or happen at once. Signs are given in `Structure.guard_values`, and by the `level`
+of the target.
 
 If a crossing has a wrong time, look at `ChartFlow.locate`; if functions of another chart are
 evaluated, at `chart_flow` and `ChartFlow.rows`.

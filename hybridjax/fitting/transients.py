@@ -289,13 +289,13 @@ def _require_times(start: Guess, *lists: np.ndarray) -> None:
         if not len(times):
             continue
         begin = float(start.time)
-        steps = np.diff(times, prepend=begin - 1)
-        if not (steps > 0).all():
-            raise DefinitionError("times of a trajectory must increase.")
         if times[0] < begin:
             raise DefinitionError(
                 f"a time, {times[0]:.6g}, comes before the start at {begin:.6g}."
             )
+        steps = np.diff(times, prepend=begin - 1)
+        if not (steps > 0).all():
+            raise DefinitionError("times of a trajectory must increase.")
 
 
 def _samples(

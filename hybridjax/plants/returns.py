@@ -17,8 +17,12 @@ It then calls `measured_returns`, which takes four stages:
 
 Stages 2 to 4 are repeated with the longest steps if noise may hide a multiplier, and with shorter
 steps if narrow and wide steps disagree. For a wrong multiplier, compare `ReturnMap.slopes` with a
-known Jacobian, then each stage with the one before. The constants may be changed: comments say what
-gets worse in either direction.
+known Jacobian, then each stage with the one before.
+
+The constants may be changed: comments of most say what gets worse in either direction. `_STEPS`
+must rise from 1, and have more entries than `_POWERS_OF_SCATTER`. Both states of a pair must have
+the same grid, since its shift would count as a slope. `amplitude.py` calls `measure_ranges`,
+`grid_may_move` and `changes_over_grids` without `measure`: they must not need what it finds.
 """
 
 from typing import Any, NamedTuple

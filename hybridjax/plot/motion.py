@@ -2,9 +2,9 @@
 
 `animate` takes the stages in order: what moves (`_motions`), the times of frames (`_tracks`), and
 panels that each add *parts* (`_film`): an artist, the function that moves it, and its argument for
-each frame. All arguments are computed in advance, so that a frame only moves artists; `Motion`
-plays and writes them (`film.py`). A branch has one cycle in each frame (`_of_branch`). The explorer
-uses `portrait`, too.
+each frame. Arguments are computed in advance, so that a frame only moves artists; `Motion` plays
+and writes them (`film.py`). A branch has one cycle in each frame, of which trajectory and
+multipliers are computed there (`_of_branch`). The explorer uses `portrait`, too.
 
 A new panel is a function that returns parts, called in `_film`. If the speed is wrong, look at
 `_pace`; if something is drawn at a wrong time, at `Track.wrapped`; if an event flashes at a wrong

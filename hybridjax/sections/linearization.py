@@ -3,10 +3,14 @@
 
 It returns an `LDTP` with matrices A, B, C, D at each section. `_matrices` computes them from the
 Jacobians of the flow from section to section (`PlacedSections.between`) and from derivatives of the
-outputs (`_output_jacobians`). There are three ways, which must agree: on the host (`_matrices_of`,
-with derivatives `_matrices_along`); in a program of JAX, along the recorded itinerary of a known
-cycle (`_on_walk`, see `walk.py`); and in a program, by a search (`_searched`). Delays of inputs and
-outputs are in `Delayed`.
+outputs (`_output_jacobians`). There are two ways, which must agree, and `linearize` chooses:
+
+- by a search for the sections: `_matrices_of`; `_of_family` for a cycle that JAX traces, whose
+  derivatives outside of programs are `_matrices_along`;
+- along the recorded itinerary of a known cycle, if there is one (see `walk.py`): `_on_walk` in a
+  program, and `_of_walk` outside, which searches where sections leave the itinerary.
+
+Delays of inputs and outputs are in `Delayed`.
 
 If one way differs from the others, look at its function; if all matrices are wrong, at
 `PlacedSections.frames`; if only C and D are, at `_output_jacobians`; if only models with a delay
@@ -118,7 +122,7 @@ def linearize(
         *(range(len(s.charts)) if traced else np.unique(placed.lanes.chart).tolist())
     )
     names, columns = s.inputs_among(inputs)
-    # One of the three ways.
+    # (See the module.)
     family = as_family(placed) if of_family else None
     walk = None if family is None else walk_beside(cycle, family)
     if family is not None and walk is not None:

@@ -4,7 +4,8 @@ The *itinerary* of the known cycle is the sequence of charts, steps and events f
 section, stored as a table (`engine/itinerary`); a `Walk` has it. Inside of a program of JAX, where
 nothing searches, a neighboring cycle follows it: one run gives times and states on the sections,
 and the derivatives of the flow from each section to the next. `place.py` and `linearization.py`
-call `walk_beside` (is there a walk?) and `walked`. Sections that leave the walk have a result code,
+call `walk_beside` (is there a walk?) and `walked`; fits call `walk_with` (`fitting/beside.py`).
+Sections that leave the walk have a result code,
 which must not get lost: where it is not OK, `linearization.py` computes matrices anew, or they are
 NaN (`PlacedSections.between`). A *leg* is a part between two events or sections.
 

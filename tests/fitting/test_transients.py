@@ -156,6 +156,10 @@ def test_standard_errors_are_those_of_many_draws():
             "0.2, comes before the start at 0.5",
         ),
         (
+            lambda d: d(hj.Guess("main", (1.0, 0.0), 2.0), [0.2], "y", [[1.0]]),
+            "0.2, comes before the start at 2",
+        ),
+        (
             lambda d: d(hj.Guess("main", ((1.0, 0.0), (2.0, 0.0))), [0.2], "y", [[1]]),
             "`start` must have one state",
         ),

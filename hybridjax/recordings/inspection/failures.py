@@ -4,8 +4,10 @@
 return masks of samples, which are then left out; the others yield findings. `placeholders` and
 `frozen` must take the same arguments, since `inspect.py` calls both in one loop.
 
-The constants are the limits: if good samples are left out, or a failure passes, look at those of
-the function whose title the finding has.
+If good samples are left out, or a failure passes, look at the function that finds it ("no value" is
+`placeholders`, "frozen" is `frozen`, "overflow" is `wrapped`), and at the constants that it uses:
+they are the limits. `placeholders` uses `RANGES` of `smoothing.py` and the list in
+`_is_placeholder`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
