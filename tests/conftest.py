@@ -155,14 +155,9 @@ def forget_programs():
 
 
 @pytest.fixture(autouse=True)
-def forget_cycles(request):
-    """Of other tests, where a test replaces parts of the package."""
-    patched = "monkeypatch" in request.fixturenames
-    if patched:
-        find._found.clear()
-    yield
-    if patched:
-        find._found.clear()
+def forget_cycles():
+    """Of other tests: each test searches."""
+    find._found.clear()
 
 
 @pytest.fixture(autouse=True)

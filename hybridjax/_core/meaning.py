@@ -223,6 +223,8 @@ def _are_many(x: Definition) -> bool:
     return len({y.shape[:1] for y in leaves}) == 1 and leaves[0].ndim > 0
 
 
+# The name of what is known by its code, and not by a program.
+_RULE = "a rule of a derivative, or a callback,"
 # States and inputs of a part are the first of so many numbers. Fewer: larger systems cannot be
 # traced.
 _NUMBERS = 1 << 20
@@ -280,7 +282,7 @@ def _traced(x: Definition, arrays: Any, reading: Reading, anew: bool) -> dict[st
         before = parts.get(name, "")
         parts[name] = digest_of_words(about, before, *values)
     if rule:
-        parts["a rule of a derivative, or a callback,"] = rule
+        parts[_RULE] = rule
     return parts
 
 
@@ -367,6 +369,13 @@ def program_digest(x: Any) -> str:
     """Return the digest of a definition that is known by its programs, "" for other things."""
     is_traced = isinstance(x, Definition) and x.code_digest in _programs
     return x.code_digest if is_traced else ""
+
+
+def is_all_program(x: Any) -> bool:
+    """Return whether a definition is known by its programs alone: it has no callbacks, which may
+    read what no program shows (files, large arrays), and no rules for derivatives."""
+    digest = program_digest(x)
+    return bool(digest) and _RULE not in _programs[digest]
 
 
 def code_of(x: Definition) -> str:

@@ -21,6 +21,7 @@ wrongly has its cause in `verdict.py` and `checks.py`; one that is inaccurate in
 """
 
 import dataclasses
+import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -28,11 +29,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._core import jax_compat
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
 from .._core.compilation import computation, uncollected
 from .._core.executor import is_inside_program, is_traced, is_tracer, to_host
-from .._core.meaning import program_digest
+from .._core.meaning import is_all_program
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result, update_result
@@ -98,6 +100,7 @@ _EVENTFUL = 8
 # given. More: memory. Fewer: cells of a notebook that are run again search again.
 _REMEMBERED = 16
 _found: dict[tuple, LimitCycle] = {}
+_one_at_a_time = threading.Lock()
 # Results of a search that has found a cycle (an isolated one, or one of a family); and results
 # after which the search begins again from a later state.
 _FOUND = Result.OK, Result.SINGULAR
@@ -279,27 +282,29 @@ def _once(
     that cycle is returned.
 
     Systems are equal if they compute the same, also if they are of a class that was defined again,
-    as by a cell of a notebook that is run again (see `_core/meaning.py`).
+    as by a cell of a notebook that is run again (see `_core/meaning.py`). Systems with callbacks
+    are searched always, since what a callback reads may have changed.
     """
-    if is_inside_program() or not program_digest(system):
+    debugs = not jax_compat.runs_programs_as_they_are()
+    if debugs or is_inside_program() or not is_all_program(system):
         return search()
-    asked = computation((system, arguments))
-    found = _found.pop(asked, None)
+    settings = jax_compat.settings_of_programs()
+    asked = settings, *computation((system, arguments))
+    with _one_at_a_time:
+        found = _found.pop(asked, None)
     if found is None:
         cycle = search()
-        if int(cycle.result) == Result.OK:
-            _remember(asked, _copy(cycle, system))
-        return cycle
-    _remember(asked, found)
-    return _copy(found, system)
-
-
-def _remember(asked: tuple, cycle: LimitCycle) -> None:
-    """Keep a cycle as the newest one, and forget the oldest of too many."""
-    _found[asked] = cycle
-    if len(_found) > _REMEMBERED:
-        oldest = next(iter(_found))
-        _found.pop(oldest, None)
+        if int(cycle.result) != Result.OK:
+            return cycle
+        found = _copy(cycle, system)
+    else:
+        cycle = _copy(found, system)
+    with _one_at_a_time:
+        _found[asked] = found
+        if len(_found) > _REMEMBERED:
+            oldest = next(iter(_found))
+            del _found[oldest]
+    return cycle
 
 
 def _copy(cycle: LimitCycle, system: HybridSystem) -> LimitCycle:
@@ -307,10 +312,13 @@ def _copy(cycle: LimitCycle, system: HybridSystem) -> LimitCycle:
     a system that computes the same (its outputs and drawings may be others)."""
 
     def copied(x: Any) -> Any:
-        return jax.device_put(np.array(x)) if isinstance(x, jax.Array) else x
+        if isinstance(x, jax.Array):
+            return jax.device_put(np.array(x))
+        return np.array(x) if isinstance(x, np.ndarray) else x
 
-    other = jax.tree_util.tree_map(copied, cycle)
-    other = dataclasses.replace(other, system=system, numbers=copies_of(system))
+    # (The arrays of the other system may have been written over.)
+    other = dataclasses.replace(cycle, system=system, numbers=copies_of(system))
+    other = jax.tree_util.tree_map(copied, other)
     keep_verdict(other, cycle)
     return remembering(other, cycle)
 
@@ -416,7 +424,8 @@ def _near_cycle(request: _Request, known: LimitCycle, traced: bool) -> LimitCycl
             return cycle
     begin = time.thread_time()
     cycle = _searched(request)
-    note_search(known, map, time.thread_time() - begin)
+    if request.section is None:
+        note_search(known, map, time.thread_time() - begin)
     return cycle
 
 

@@ -144,7 +144,6 @@ def test_an_order_that_is_too_high_is_a_finding(plant):
         hj.fit_series(recorded(plant), 3)
 
 
-@pytest.mark.slow
 def test_drift_is_a_finding(plant):
     data = recorded(plant, drift=30.0)
     assert "drift" in causes(hj.fit_series(data, 2, check=False))

@@ -157,7 +157,6 @@ def test_faint_lines_of_a_reference_are_left_out(plant):
         assert htf.error(plant.htf(htf.frequencies)) < 1e-9
 
 
-@pytest.mark.slow
 def test_discs_and_multipliers_of_transfer_functions_hold(plant):
     truth = None
     held = []

@@ -140,7 +140,6 @@ def test_an_event_that_is_new_is_a_code_inside_of_programs(free):
     assert result(2.0) == hj.errors.Result.EVENT_ORDER
 
 
-@pytest.mark.slow
 def test_an_event_in_the_last_step_of_a_turn_is_noticed():
     """Also if the guard is positive again where the turn ends."""
     gain = amplitude(1.0)

@@ -56,7 +56,6 @@ def test_a_guess_that_is_far_too_large_leads_to_the_same_cycle(size):
         (BEAT, (0.6,), {"multiplicity": 2}, "closes sooner than after the 2 periods"),
     ],
 )
-@pytest.mark.slow
 def test_what_is_no_cycle(system, guess, options, message):
     x, *time = guess
     with pytest.raises(hj.errors.HybridJaxError, match=message):

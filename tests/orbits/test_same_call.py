@@ -145,15 +145,53 @@ def test_few_cycles_near_a_known_one_are_not_worth_compiling(monkeypatch):
         hj.find_limit_cycle(hj.models.VanDerPol(mu=1.05), cycle)
 
 
-def test_calls_share_no_numbers(searches):
-    """A user may let JAX write over the numbers of one cycle, and has the other still."""
-    first = circle()
-    given = circle()
-    held = [x for x in jax.tree_util.tree_leaves(given) if isinstance(x, jax.Array)]
-    assert held
-    for x in held:
-        x.delete()
-    for cycle in (first, circle()):
-        assert_allclose(cycle.period, 2 * np.pi, rtol=0, atol=1e-10)
-        assert_allclose(cycle.multipliers, np.exp(-4 * np.pi), rtol=1e-6)
+def oscillation():
+    return hj.find_limit_cycle(hj.models.VanDerPol(mu=1.0))
+
+
+@pytest.mark.parametrize("given_away", ["first", "second"])
+def test_calls_share_no_numbers(searches, given_away):
+    """A user may let JAX write over the numbers of one cycle, and has the others still."""
+    cycles = {"first": oscillation(), "second": oscillation()}
+    lost = cycles.pop(given_away)
+    (kept,) = cycles.values()
+    for x in jax.tree_util.tree_leaves(lost):
+        if isinstance(x, jax.Array):
+            x.delete()
+        elif isinstance(x, np.ndarray):
+            x[...] = np.nan
+    for cycle in (kept, oscillation()):
+        assert_allclose(cycle.period, 6.6632868593, rtol=0, atol=1e-9)
+        assert np.isfinite(cycle.settings.rtol)
+        assert len(cycle.multipliers) == 1
     assert len(searches) == 1
+
+
+@pytest.mark.slow
+def test_systems_with_callbacks_are_searched_each_time(searches):
+    """What a callback reads may have changed, and no program shows it."""
+    rate = np.ones(200_000)  # (too large to be read)
+
+    def told(x):
+        return rate[0] * x
+
+    @jax.custom_jvp
+    def scaled(x):
+        return jax.pure_callback(
+            told, jax.ShapeDtypeStruct((), x.dtype), x, vmap_method="sequential"
+        )
+
+    @scaled.defjvp
+    def along(primals, tangents):
+        return scaled(*primals), scaled(*tangents)
+
+    def field(t, q):
+        x, y = q
+        inward = 1 - x**2 - y**2
+        return inward * x - scaled(y), inward * y + scaled(x)
+
+    for speed in (1.0, 2.0):
+        rate[:] = speed
+        cycle = hj.find_limit_cycle(field, (1.1, 0.2))
+        assert_allclose(cycle.period, 2 * np.pi / speed, rtol=0, atol=1e-9)
+    assert len(searches) == 2

@@ -241,7 +241,6 @@ def test_an_event_at_the_zero_of_a_guard_of_time_alone_is_none_beside_its_guard(
     assert cycle.multipliers == pytest.approx(expected_multipliers, abs=1e-12)
 
 
-@pytest.mark.slow
 def test_a_failed_cycle_of_a_sweep_says_so_where_its_checks_are_asked_for():
     guess = hj.Guess("up", (0.0,))
     good = hj.find_limit_cycle(SchmittTrigger(), guess)

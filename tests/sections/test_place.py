@@ -329,7 +329,6 @@ def states_of(tape):
     return states[np.asarray(tape.code).T >= 0]
 
 
-@pytest.mark.slow
 def test_a_section_at_the_time_of_an_event_is_refused():
     wheel = hj.find_limit_cycle(hj.models.RimlessWheel())
     (impact, *_) = wheel.trajectory().events

@@ -129,8 +129,10 @@ class SeriesFit(MultiplierFit):
       multipliers (outside of each other's confidence regions); "order" if a fit with one or two
       multipliers more contradicts this fit in the same way; "feedback" if inputs depend on earlier
       residuals, as with a controller, so that the fit is biased; "distortion" if residuals follow
-      products of earlier responses (`covariance` is then that of a jackknife); "changing system" if
-      the multipliers of earlier and later cycles differ; "undetermined"; "no convergence".
+      products of earlier responses; "changing system" if the multipliers of earlier and later
+      cycles differ; "undetermined"; "no convergence". With "distortion", or if residuals are
+      below 1 % of the responses (as in simulations without noise), `covariance` is that of a
+      jackknife where this is larger.
     """
 
     numerators: Float[np.ndarray, "N R ny nu"]
@@ -393,6 +395,14 @@ def _fit_open_loop(
     grid = records.whole()
     predicted = fit.predicted(grid, free_start)
     error = np.where(grid.sampled, grid.y - predicted, 0.0)
+    distortion = []
+    if is_distorted(grid, error, predicted, fit.coefficients):
+        distortion = [WIDENED]
+    if distortion or is_quiet(grid, error, predicted):
+        wider = jackknife(best.problem, best.solution, covariance)
+        fit = dataclasses.replace(
+            fit, covariance=wider.matrix, covariance_dof=wider.dof
+        )
     answers = about_answers(grid, error, records.inputs, _BIASED)
     drift = _about_drift(fit, records, free_start)
 
@@ -411,14 +421,6 @@ def _fit_open_loop(
         ]
         doubts = order_doubts(fit, higher) or left_out(higher[0])
     changes = [_CHANGES] if p_steady < _STEADY else []
-    distortion = []
-    if is_distorted(grid, error, predicted, fit.coefficients):
-        distortion = [WIDENED]
-    if distortion or is_quiet(grid, error, predicted):
-        wider = jackknife(best.problem, best.solution, covariance)
-        fit = dataclasses.replace(
-            fit, covariance=wider.matrix, covariance_dof=wider.dof
-        )
     return dataclasses.replace(
         fit, findings=(*fit.findings, *doubts, *distortion, *changes, *answers)
     )
@@ -586,7 +588,7 @@ _FILTERED_DRAWS = 16
 _FEWEST_BLOCKS = 6
 # A jackknife leaves out at least this number of blocks more than coefficients, and at most so many.
 # Fewer: it scatters. More: time.
-_FEWEST_LEFT_OUT = 3
+_FEWEST_LEFT_OUT = 6
 _MOST_LEFT_OUT = 20
 
 
@@ -637,20 +639,44 @@ def jackknife(
     that is right for errors of equal size is too small. The jackknife is not; for errors of equal
     size it is too large (HC3: MacKinnon and White, J. Econometrics 29, 1985).
 
-    **Arguments:** `stated`: the covariance for errors of equal size. It is returned if it is
-    larger, or if there are too few blocks.
+    **Arguments:** `stated`: the covariance for errors of equal size. In directions in which it is
+    larger, it is kept; in all of them, if there are too few blocks.
     """
     c = solution.c
     cycles = problem.records.cycles
     lags = denominator.correlated_cycles(multipliers_of(c), cycles)
-    steps = [_step(linearize(part, c)) for part in _without_blocks(problem, lags + 1)]
-    blocks = len(steps)
+    parts = list(_without_blocks(problem, lags + 1))
+    blocks = len(parts)
     if blocks < len(c) + _FEWEST_LEFT_OUT or not np.isfinite(stated.matrix).all():
         return stated
-    deviation = np.array(steps) - np.mean(steps, axis=0)
+    linear = [linearize(part, c) for part in parts]
+    # (A section without residuals has no gradient, and the step would be arbitrary.)
+    if any((part.dof <= len(c)).any() for part in linear):
+        return stated
+    steps = np.array([_step(part) for part in linear])
+    deviation = steps - steps.mean(axis=0)
     matrix = (blocks - 1) / blocks * deviation.T @ deviation
-    ratio = np.trace(np.linalg.solve(stated.matrix, matrix)) / len(c)
-    return Covariance(matrix, min(stated.dof, blocks - 1)) if ratio > 1 else stated
+    larger = _larger(matrix, stated.matrix)
+    if larger is None:
+        return stated
+    return Covariance(larger, min(stated.dof, blocks - 1))
+
+
+def _larger(
+    matrix: Float[np.ndarray, "d d"], least: Float[np.ndarray, "d d"]
+) -> Float[np.ndarray, "d d"] | None:
+    """Return the covariance that has the larger variance of two in each of the directions in which
+    both are diagonal. None if they are equal to `least`, or if that is singular."""
+    values, vectors = np.linalg.eigh(least)
+    if values[0] <= 0:
+        return None
+    root = vectors * np.sqrt(values)
+    inverse = vectors / np.sqrt(values)
+    ratios, directions = np.linalg.eigh(inverse.T @ matrix @ inverse)
+    if ratios[-1] <= 1:
+        return None
+    axes = root @ directions
+    return axes * np.maximum(ratios, 1.0) @ axes.T
 
 
 def _step(solution: Linearization) -> Coefficients:
