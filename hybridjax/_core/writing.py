@@ -99,6 +99,8 @@ def require_free(folder: Path, kind: str, names: Iterable[str]) -> None:
     """**Raises:** `DefinitionError` if `results_folder` would refuse to write these results, before
     they are computed."""
     _refuse_link(folder)
+    if folder.exists() and not folder.is_dir():
+        raise DefinitionError(f"cannot write to '{folder}': it is a file.")
     _refuse_others(folder, names, _listed(folder, kind))
 
 

@@ -474,6 +474,14 @@ def test_a_foreign_file_is_refused_before_any_subject(tmp_path, name):
         hj.identify_subjects(table, tmp_path, lambda recording: 1 / 0)
 
 
+def test_a_study_into_a_file_is_refused_before_any_subject(tmp_path):
+    file = tmp_path / "study"
+    file.write_text("mine")
+    table = {"file": ["S1.csv"], "subject": ["S1"]}
+    with pytest.raises(hj.errors.DefinitionError, match="study': it is a file"):
+        hj.identify_subjects(table, file, lambda recording: 1 / 0)
+
+
 def write_subjects(folder, rhythm):
     """Write recordings of six subjects in two groups, and a table that names a seventh, too."""
     rows = ["file,subject,group,age"]
