@@ -44,7 +44,7 @@ import pytest
 import hybridjax as hj
 from hybridjax._core import compilation
 from hybridjax._core.execution import libraries
-from hybridjax.orbits import find
+from hybridjax.orbits import same_call
 
 
 # Files whose fast tests cover each capability once, for `-m core`.
@@ -157,7 +157,7 @@ def forget_programs():
 @pytest.fixture(autouse=True)
 def forget_cycles():
     """Of other tests: each test searches."""
-    find._found.clear()
+    same_call._found.clear()
 
 
 @pytest.fixture(autouse=True)
@@ -179,7 +179,7 @@ def compiled():
             names.add(re.sub(r"^jit\(|_[0-9a-f]{32}|\)$", "", fun_name))
 
     compilation.WORTH_COMPILING = np.inf
-    find._found.clear()
+    same_call._found.clear()
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         yield names

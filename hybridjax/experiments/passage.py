@@ -16,6 +16,7 @@ events); if `error` does, at `share` in `_leg`. If too many lanes leave the tabl
 `rows.py`.
 """
 
+import dataclasses
 import functools as ft
 from typing import Any, NamedTuple
 
@@ -173,22 +174,18 @@ def _at(x: Array, k: Int[Array, ""]) -> Array:
     return jax.lax.dynamic_index_in_dim(x, k, 0, keepdims=False)
 
 
+@dataclasses.dataclass(eq=False)
 class _Moves:
     """The functions that rows of the table call."""
 
-    def __init__(
-        self,
-        course: Course,
-        plan: Plan,
-        settings: Settings,
-        feedback: Feedback | None,
-        form: Form,
-    ):
-        self.course = course
-        self.plan = plan
-        self.settings = settings
-        self.feedback = feedback
-        self.form = form
+    course: Course
+    plan: Plan
+    settings: Settings
+    feedback: Feedback | None
+    form: Form
+
+    def __post_init__(self):
+        course = self.course
         self.s = Structure(course.system)
         self.outputs = self.s.resolve_outputs(course.outputs)
         self.levels = course.bound.levels
@@ -196,8 +193,8 @@ class _Moves:
         following = (jnp.arange(self.N) + 1) % self.N
         turns = jnp.where(following == 0, course.period, 0.0)
         self.ends = course.bound.time[following] + turns
-        assert settings.rtol is not None
-        self.allowed = _LAST * course.period * jnp.sqrt(settings.rtol)
+        assert self.settings.rtol is not None
+        self.allowed = _LAST * course.period * jnp.sqrt(self.settings.rtol)
 
     def begin(self, start: Float[Array, "m S"], S: int) -> Passage:
         zero = jnp.zeros(S)

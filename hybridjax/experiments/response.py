@@ -196,20 +196,17 @@ class _Sample(NamedTuple):
     """Values that the controller added to the inputs."""
 
 
+@dataclasses.dataclass(eq=False)
 class _Moves:
     """Moves of S experiments from a section to the next."""
 
-    def __init__(
-        self,
-        course: Course,
-        plan: Plan,
-        settings: Settings,
-        feedback: Feedback | None,
-    ):
-        self.course = course
-        self.plan = plan
-        self.settings = settings
-        self.feedback = feedback
+    course: Course
+    plan: Plan
+    settings: Settings
+    feedback: Feedback | None
+
+    def __post_init__(self):
+        course = self.course
         self.s = Structure(course.system)
         self.z = self.s.resolve_outputs(course.outputs)
         self.N = len(course.bound.time)

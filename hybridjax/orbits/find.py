@@ -17,24 +17,21 @@ return map, and *sizes* of states are their magnitudes, relative to which errors
 
 If a search fails without need, look at these attempts in turn. A cycle that is refused or accepted
 wrongly has its cause in `verdict.py` and `checks.py`; one that is inaccurate in a single state, in
-`_in_own_sizes`; one that belongs to an earlier call, in `_once`.
+`_in_own_sizes`; one that belongs to an earlier call, in `same_call.py`.
 """
 
 import dataclasses
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from .._core import jax_compat
 from .._core.boundary.checked import checked
 from .._core.boundary.kinds import Count, Duration, Positive, Scalar, Wait
-from .._core.compilation import computation, uncollected
+from .._core.compilation import uncollected
 from .._core.executor import is_inside_program, is_traced, is_tracer, to_host
-from .._core.meaning import is_all_program
 from .._core.precision import real, require_x64
 from .._core.progress import say, working
 from .._core.results import Result, update_result
@@ -72,6 +69,7 @@ from .newton import Solution, search, solve
 from .periodic import has_period
 from .return_map import ENOUGH, PATIENCE, ReturnMap, Turn
 from .rivals import coincident, meet
+from .same_call import once
 from .scale import (
     Sizes,
     given_sizes,
@@ -81,7 +79,7 @@ from .scale import (
     sizes_on,
     stiff_charts,
 )
-from .verdict import keep_verdict, verdict
+from .verdict import verdict
 
 
 # Sizes are estimated before the cycle is known. If an estimate was too large by more than this
@@ -96,11 +94,6 @@ _LATEST = 40
 # Periods within which an event is chosen as the section, in place of a plane. Fewer: rare events
 # are missed. More: time.
 _EVENTFUL = 8
-# Number of cycles that searches from states have found, and that calls with the same arguments are
-# given. More: memory. Fewer: cells of a notebook that are run again search again.
-_REMEMBERED = 16
-_found: dict[tuple, LimitCycle] = {}
-_one_at_a_time = threading.Lock()
 # Results of a search that has found a cycle (an isolated one, or one of a family); and results
 # after which the search begins again from a later state.
 _FOUND = Result.OK, Result.SINGULAR
@@ -268,59 +261,11 @@ def find_limit_cycle(
         request = _Request(map, None, section, given, patient, settle, throw)
         return _from_guess(request)
 
-    return _once(system, (begin, values, patient), search)
+    return once(system, (begin, values, patient), search)
 
 
 def _numbers(conserved: Mapping[str, Any]) -> dict[str, Any]:
     return {name: real(value) for name, value in conserved.items()}
-
-
-def _once(
-    system: HybridSystem, arguments: tuple, search: Callable[[], LimitCycle]
-) -> LimitCycle:
-    """The cycle that a search finds. If it has found one for an equal system and equal arguments,
-    that cycle is returned.
-
-    Systems are equal if they compute the same, also if they are of a class that was defined again,
-    as by a cell of a notebook that is run again (see `_core/meaning.py`). Systems with callbacks
-    are searched always, since what a callback reads may have changed.
-    """
-    debugs = not jax_compat.runs_programs_as_they_are()
-    if debugs or is_inside_program() or not is_all_program(system):
-        return search()
-    settings = jax_compat.settings_of_programs()
-    asked = settings, *computation((system, arguments))
-    with _one_at_a_time:
-        found = _found.pop(asked, None)
-    if found is None:
-        cycle = search()
-        if int(cycle.result) != Result.OK:
-            return cycle
-        found = _copy(cycle, system)
-    else:
-        cycle = _copy(found, system)
-    with _one_at_a_time:
-        _found[asked] = found
-        if len(_found) > _REMEMBERED:
-            oldest = next(iter(_found))
-            del _found[oldest]
-    return cycle
-
-
-def _copy(cycle: LimitCycle, system: HybridSystem) -> LimitCycle:
-    """The cycle with arrays of its own, since users may let JAX write over those that they have; of
-    a system that computes the same (its outputs and drawings may be others)."""
-
-    def copied(x: Any) -> Any:
-        if isinstance(x, jax.Array):
-            return jax.device_put(np.array(x))
-        return np.array(x) if isinstance(x, np.ndarray) else x
-
-    # (The arrays of the other system may have been written over.)
-    other = dataclasses.replace(cycle, system=system, numbers=copies_of(system))
-    other = jax.tree_util.tree_map(copied, other)
-    keep_verdict(other, cycle)
-    return remembering(other, cycle)
 
 
 class _Request(NamedTuple):

@@ -223,6 +223,8 @@ def bode(
     if isinstance(fits, Mapping):
         raise DefinitionError("`fits` by name need HTFs by name: pass a dict of them.")
     shown, beside = _apart(_one_by_one(htfs))
+    if not any(isinstance(htf, HTF) for htf in shown):
+        _refuse_in_band(beside)
     drawn = _exact_first(shown)
     fits = (*beside, *((fits,) if isinstance(fits, Fit) else fits))
     fitted = [fit.htf(drawn[-1].frequencies) for fit in fits]
@@ -504,17 +506,23 @@ def _grid(
         letters(axes)
 
 
+def _refuse_in_band(fits: Sequence[Transfer]) -> None:
+    """**Raises:** `DefinitionError` for a fit that holds in the band of its data, where it would be
+    drawn over all frequencies."""
+    for fit in fits:
+        if isinstance(fit, InBand):
+            raise DefinitionError(
+                f"a {type(fit).__name__} holds in the band of its data: draw it beside their HTF, "
+                "`hj.plot.bode(htf, fit)`, or its own, `fit.htf(frequencies)`."
+            )
+
+
 def _exact_first(htfs: Sequence[Transfer]) -> list[HTF]:
     if not htfs:
         raise DefinitionError("`htfs` holds nothing to draw.")
     grids = [htf.frequencies for htf in htfs if isinstance(htf, HTF)]
     if not grids:
-        for fit in htfs:
-            if isinstance(fit, InBand):
-                raise DefinitionError(
-                    f"a {type(fit).__name__} holds in the band of its data: draw it beside their "
-                    "HTF, `hj.plot.bode(htf, fit)`, or its own, `fit.htf(frequencies)`."
-                )
+        _refuse_in_band(htfs)
         grids = [np.linspace(0, htfs[0].n_sections / 2, _FREQUENCIES)]
     drawn = [htf if isinstance(htf, HTF) else htf.htf(grids[0]) for htf in htfs]
     return sorted(drawn, key=lambda htf: htf.source != "exact")

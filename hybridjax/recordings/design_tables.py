@@ -89,8 +89,10 @@ def attach_design(recording: RecordingLike, phase: Phase, path: FilePath) -> Rec
         findings = []
         if stretches:
             first = stretches[0]
-            if len(stretches) > 1:
-                findings.append(_after_gap(trial, first))
+            # (After the last section of a trial, up to a cycle is unknown.)
+            cycle = np.ptp(first.time) / np.ptp(first.phase)
+            if trial.time[-1] - first.time[-1] > cycle:
+                findings.append(_after_end(trial, first))
             now = first.at(trial.time)
             during = np.isfinite(now)
             first_whole = np.ceil(first.phase[0])
@@ -104,12 +106,12 @@ def attach_design(recording: RecordingLike, phase: Phase, path: FilePath) -> Rec
     return Recording.join(trials)
 
 
-def _after_gap(trial: Trial, stretch: Winding) -> Finding:
+def _after_end(trial: Trial, stretch: Winding) -> Finding:
     """Return the finding about the samples of a trial after its first stretch."""
     stop = stretch.time[-1]
     count = int((trial.time > stop).sum())
     text = (
         f"trial '{trial.name}': the command is unknown in {count} samples after {stop:.6g} s, "
-        "where its phase is interrupted, as cycles are not counted from there on."
+        "where its phase is interrupted or ends, as cycles are not counted from there on."
     )
     return Finding("command unknown", text, "left out")

@@ -334,7 +334,7 @@ class Recording(Showable, eqx.Module, metaclass=Leading):
         A part has the samples from `start` on and before `stop`: two parts side by side,
         `crop(None, t)` and `crop(t, None)`, have no sample twice. Signals, units, findings and
         names stay. Events between the two times stay, except those that are more than a sample away
-        from the samples that are left. A trial with less than two samples in between is left out.
+        from the samples that are left. A trial with fewer than two samples in between is left out.
 
         **Arguments:** `start` and `stop`: times in s on the clock of the trials, as in
         `recording.time`; they do not count from the first sample. Default: None, no limit.
@@ -488,7 +488,7 @@ def _about_nothing_left(
     ]
     more = ", ..." if len(recording) > _NAMED else ""
     return (
-        f"Recording.crop: less than two samples {asked} are left: samples lie in "
+        f"Recording.crop: fewer than two samples {asked} are left: samples lie in "
         f"{', '.join(spans)}{more}."
     )
 

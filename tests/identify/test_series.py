@@ -10,11 +10,11 @@ from hypothesis import given, settings, strategies as st
 import hybridjax as hj
 from hybridjax.errors import FindingWarning
 from hybridjax.identify.multiplier_estimate import MultiplierEstimate, contradicted_by
+from hybridjax.identify.series.covariance import block_scores
 from hybridjax.identify.series.delayed_outputs import (
     late_outputs,
     total_least_squares,
 )
-from hybridjax.identify.series.fit import block_scores
 from hybridjax.identify.series.linearization import (
     each_fit,
     filtered_response,

@@ -308,6 +308,8 @@ def test_fits_are_drawn_beside_htfs_and_alone(hopper, estimate, structured):
             draw(structured)
         with pytest.raises(hj.errors.DefinitionError, match="band of its data"):
             draw({"a": structured})
+        with pytest.raises(hj.errors.DefinitionError, match="band of its data"):
+            draw(hopper, structured)
 
 
 # The complex plane

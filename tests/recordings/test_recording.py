@@ -100,7 +100,7 @@ def test_a_part_has_the_samples_and_events_between_two_times(whole, first, secon
         if within.sum() > 1:
             expected.append((trial, within))
     if not expected:
-        with pytest.raises(hj.errors.DefinitionError, match="less than two"):
+        with pytest.raises(hj.errors.DefinitionError, match="fewer than two"):
             whole.crop(start, stop)
         return
     part = whole.crop(start, stop)
@@ -146,10 +146,10 @@ def test_parts_that_cannot_be():
     for start, stop, message in (
         (3.0, 1.0, "`start` must be before `stop`, not 3 and 1"),
         (2.0, 2.0, "`start` must be before `stop`, not 2 and 2"),
-        (1.5, 2.5, "less than two samples .* lie in 0 to 4 s .'walk'., 100 to 104 s"),
+        (1.5, 2.5, "fewer than two samples .* lie in 0 to 4 s .'walk'., 100 to 104 s"),
         (7, None, None),
-        (500, None, "less than two samples from 500 s on"),
-        (None, -1.0, "less than two samples before -1 s"),
+        (500, None, "fewer than two samples from 500 s on"),
+        (None, -1.0, "fewer than two samples before -1 s"),
         ("a", None, "`start` must be a finite number"),
         (np.nan, None, "`start` must be a finite number"),
     ):
