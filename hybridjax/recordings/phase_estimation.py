@@ -92,8 +92,8 @@ def estimate_phase(
     median, in seconds.
 
     **Raises:** `DefinitionError` for unknown signals or events, sections that a recording cannot
-    have (functions of a state, charts), a phase that does not wind, or a recording of less than two
-    cycles.
+    have (functions of a state, charts), a phase that does not wind, or a recording of fewer than
+    two cycles.
 
     **Example:**
 

@@ -536,7 +536,7 @@ def _require_finite(where: str, name: str, values: Series) -> None:
 
 
 def _require_increasing(where: str, time: Series) -> None:
-    """**Raises:** `DefinitionError` for less than two samples, and time that does not increase."""
+    """**Raises:** `DefinitionError` for fewer than two samples, and time that does not increase."""
     if len(time) < 2:
         raise DefinitionError(
             f"{where} has {len(time)} samples, but two or more are needed."

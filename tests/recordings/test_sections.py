@@ -289,15 +289,18 @@ def test_designs_as_tables(tmp_path, wave):
     assert experiments.n_sections == 8
 
 
-def test_a_command_that_a_long_gap_ends_is_reported(tmp_path, wave):
+@pytest.mark.parametrize("samples, stretches", [(200, 2), (None, 1)])
+def test_a_command_that_ends_with_the_phase_is_reported(
+    tmp_path, wave, samples, stretches
+):
     """Cycles are not counted across it, so that the place in the table is unknown."""
     design = hj.multisine(8, 16, frequencies=(0.1, 0.4), experiments=1)
     design.write(tmp_path / "phase.csv", cycles=19)
     time, values = wave.trials[0].time, wave.trials[0].values.copy()
-    values[len(time) // 2 :][:200] = np.nan
+    values[len(time) // 2 :][:samples] = np.nan
     recording = hj.Recording(time, dict(zip(wave.signals, values.T, strict=True)))
     phase = hj.recordings.estimate_phase(recording, CIRCLE)
-    assert len(phase.stretches[0]) == 2
+    assert len(phase.stretches[0]) == stretches
     told = hj.recordings.attach_design(recording, phase, tmp_path / "phase.csv")
     assert np.isnan(told["u"][len(time) // 2 + 200 :]).all()
     (finding,) = told.findings
@@ -405,7 +408,7 @@ def test_the_files_of_the_command(out):
 @pytest.mark.slow
 def test_a_failure_of_the_command_leaves_nothing(files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(hj.plot, "validation", lambda validation: 1 / 0)
+    monkeypatch.setattr(hj.identify.Validation, "plot", lambda validation: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         identify(files, "new")
     assert not list(tmp_path.iterdir())
